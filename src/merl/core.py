@@ -1,0 +1,89 @@
+"""The contracts between the rooms: what flows from the environment to the learner.
+
+Names follow the field: an *observation* is a dict of modalities, a *transition* holds a `discount`
+(0 at a true end, else 1; a time limit bootstraps), a *batch* is what one update learns from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Observation = Mapping[str, NDArray[Any]]
+"""One moment as the senses give it, a key per modality: an image is uint8 (H, W, C), a vector
+float32 (n,). Frames are single; stacks are made by the actor and by replay."""
+
+
+class MerlError(Exception):
+    """A fault that the user can mend.
+
+    Its text is one line that names the thing, the value, and the way out; the command line prints
+    it without a traceback and exits with code 2.
+    """
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What one environment step brought.
+
+    Attributes:
+        action: what was done, float32 (A,), in [-1, 1].
+        reward: what it paid.
+        discount: 0.0 if the episode truly ended here, else 1.0 (a time limit is not an end).
+        observation: what it led to.
+        last: the episode is over, by a true end or a time limit.
+    """
+
+    action: NDArray[np.float32]
+    reward: float
+    discount: float
+    observation: Observation
+    last: bool
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one update learns from: B samples of (o_t, a_t, r_{t:t+n-1}, o_{t+n}).
+
+    Attributes:
+        observation: o_t; images uint8 (B, K, H, W, C) with the oldest of the K stacked frames
+            first, vectors float32 (B, n).
+        action: a_t, float32 (B, A), in [-1, 1].
+        reward: sum of gamma^i r_{t+i} for i < m, float32 (B,); m = n, or less where the episode
+            is over sooner.
+        discount: gamma^m, or 0 where the episode truly ended; float32 (B,).
+        next_observation: o_{t+m}, as `observation`.
+    """
+
+    observation: dict[str, Tensor]
+    action: Tensor
+    reward: Tensor
+    discount: Tensor
+    next_observation: dict[str, Tensor]
+
+
+class Agent(Protocol):
+    """What the training loop asks of a learner."""
+
+    def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
+        """Actions (B, A) in [-1, 1] for stacked observations; with the noise of exploration or without."""
+        ...
+
+    def update(self, batch: Batch) -> dict[str, Tensor]:
+        """One gradient step on every network; the metrics come back as scalars on the device."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next update depends on: weights, optimizers, random generators."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take back what `state_dict` gave."""
+        ...

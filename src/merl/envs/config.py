@@ -1,0 +1,56 @@
+"""How an environment is seen: which renderer, which picture, which senses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from merl.core import MerlError
+
+RendererName = Literal["gl", "warp"]
+ProprioName = Literal["paper", "full"]
+OBSERVATIONS = ("image", "proprio", "state")
+SMALLEST_IMAGE = 16
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """How an environment is seen."""
+
+    renderer: RendererName = "gl"
+    """What draws the pictures: `gl` (OpenGL, as dm_control does) or `warp` (a ray tracer that
+    needs no OpenGL and is much faster on a CPU; its pictures look slightly different)."""
+
+    image_size: int = 84
+    """Height and width of the agent's picture, in pixels; at least 16."""
+
+    proprio: ProprioName = "paper"
+    """What the robot feels: `paper` (angles and velocities of arm and fingers, 24 numbers) or
+    `full` (also joint torques and the hand's position and rotation, 42 numbers)."""
+
+    observations: tuple[str, ...] = ("image", "proprio")
+    """What an observation holds: any of `image`, `proprio`, `state`. The rest is not computed."""
+
+    render_size: int = 480
+    """Height and width of the pictures for people (videos), in pixels; at least 16."""
+
+    def __post_init__(self) -> None:
+        _one_of("renderer", self.renderer, get_args(RendererName))
+        _one_of("proprio", self.proprio, get_args(ProprioName))
+        if not self.observations:
+            raise MerlError(f"observations is empty: name at least one of {_listed(OBSERVATIONS)}")
+        for name in self.observations:
+            _one_of("observations", name, OBSERVATIONS)
+        for field in ("image_size", "render_size"):
+            size = getattr(self, field)
+            if not isinstance(size, int) or size < SMALLEST_IMAGE:
+                raise MerlError(f"{field} is {size!r}: give a whole number from {SMALLEST_IMAGE}")
+
+
+def _one_of(field: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise MerlError(f"{field} {value!r} is unknown: choose from {_listed(allowed)}")
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return ", ".join(names)

@@ -1,0 +1,16 @@
+"""The environments' names in Gymnasium; importing this touches neither torch nor the simulator."""
+
+from __future__ import annotations
+
+from gymnasium.envs.registration import register as register_with_gymnasium
+from gymnasium.envs.registration import registry
+
+ENV_IDS = {"reach_duplo": "merl/ReachDuplo-v0"}
+"""Gymnasium's id of each task."""
+
+
+def register() -> None:
+    """Tell Gymnasium of the tasks; may be called twice."""
+    for task, env_id in ENV_IDS.items():
+        if env_id not in registry:
+            register_with_gymnasium(env_id, entry_point="merl.envs:make_env", kwargs={"task": task})

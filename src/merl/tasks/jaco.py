@@ -1,0 +1,196 @@
+"""The scene that the tasks share: a Jaco arm with a three-fingered hand over a floor, and a camera.
+
+Built from dm_control's entities, with the constants of its `manipulation` package. Lengths are in
+metres, times in seconds, angles in radians. The origin is on the floor under the middle of the
+workspace, z points up, and the camera looks along +y at the arm, which stands behind the origin.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merl.tasks import simulator  # noqa: F401  (first: it imports dm_control without OpenGL)
+
+# isort: split
+from dm_control import composer, mjcf
+from dm_control.composer import initializers
+from dm_control.composer.variation import distributions
+from dm_control.entities.manipulators import kinova
+from dm_control.manipulation.shared import arenas, cameras, workspaces
+
+CONTROL_TIMESTEP = 0.04
+"""Time between two actions, s (dm_control `manipulation.shared.constants`)."""
+EPISODE_STEPS = 250
+"""Actions in an episode: 10 s (dm_control `manipulation`)."""
+ARM_OFFSET = (0.0, 0.4, 0.0)
+"""Where the base of the arm stands, m (dm_control `manipulation.shared.robots`)."""
+CAMERA = cameras.FRONT_CLOSE
+"""The fixed camera in front of the arm: its name, position (m) and axes (dm_control)."""
+
+ProprioSet = Literal["paper", "full"]
+PROPRIO_SIZES: dict[ProprioSet, int] = {"paper": 24, "full": 42}
+"""How many numbers each set of proprioception has; see `JacoTask.proprio`."""
+_POSE_AND_VELOCITY = ("position", "orientation", "linear_velocity", "angular_velocity")
+
+Float32 = NDArray[np.float32]
+
+
+class Box(NamedTuple):
+    """An axis-aligned box from which a position is drawn uniformly."""
+
+    lower: tuple[float, float, float]
+    """Least x, y, z, m."""
+    upper: tuple[float, float, float]
+    """Greatest x, y, z, m."""
+
+
+HAND_SPAWN = Box((-0.1, -0.1, 0.2), (0.1, 0.1, 0.4))
+"""Where the tool centre point starts (dm_control `manipulation.reach`)."""
+OBJECT_SPAWN = Box((-0.1, -0.1, 0.001), (0.1, 0.1, 0.001))
+"""Where the object is let go, 1 mm above the floor, before it settles (the same)."""
+
+
+class JacoTask(composer.Task):  # type: ignore[misc]
+    """An arm, a hand and one free object; a task adds what it rewards.
+
+    In every episode the hand starts at random in `HAND_SPAWN`, pointing down with its fingers
+    closed by a random amount, and the object lies at random in `OBJECT_SPAWN`.
+
+    Attributes:
+        arm: the Jaco arm, six velocity-controlled joints.
+        hand: the Jaco hand, three velocity-controlled fingers.
+        prop: the object.
+    """
+
+    def __init__(self, prop: composer.Entity) -> None:
+        self._arena = arenas.Standard()
+        self.arm = kinova.JacoArm()
+        self.hand = kinova.JacoHand(use_pinch_site_as_tcp=True)
+        self.arm.attach(self.hand)
+        self._arena.attach_offset(self.arm, offset=ARM_OFFSET)
+        self._arena.mjcf_model.worldbody.add("camera", **CAMERA._asdict())
+        self.prop = prop
+        self._prop_frame = self._arena.add_free_entity(prop)
+        self.control_timestep = CONTROL_TIMESTEP
+        self._place_hand = initializers.ToolCenterPointInitializer(
+            self.hand,
+            self.arm,
+            position=distributions.Uniform(*HAND_SPAWN),
+            quaternion=workspaces.DOWN_QUATERNION,
+        )
+        self._place_prop = initializers.PropPlacer(
+            props=[prop],
+            position=distributions.Uniform(*OBJECT_SPAWN),
+            quaternion=workspaces.uniform_z_rotation,
+            settle_physics=True,
+        )
+
+    @property
+    def root_entity(self) -> composer.Entity:
+        """The arena, which everything is attached to."""
+        return self._arena
+
+    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        """Note where in MuJoCo's arrays the numbers lie that every step reads."""
+        del random_state
+        arm, fingers = physics.bind(self.arm.joints), physics.bind(self.hand.joints)
+        self._arm_qpos, self._arm_qvel = _addresses(physics, arm.element_id)
+        self._finger_qpos, self._finger_qvel = _addresses(physics, fingers.element_id)
+        self._arm_axes = np.array(arm.axis)
+        self._torques = _sensor_slice(physics, self.arm.joint_torque_sensors)
+        self._tcp = int(physics.bind(self.hand.tool_center_point).element_id)
+        self._prop_body = int(physics.bind(self._prop_frame).element_id)
+        sensors = [self.prop.mjcf_model.find("sensor", name) for name in _POSE_AND_VELOCITY]
+        self._prop_sensors = _sensor_slice(physics, sensors)
+
+    def initialize_episode(
+        self, physics: mjcf.Physics, random_state: np.random.RandomState
+    ) -> None:
+        """Draw where fingers, hand and object start, in dm_control's order."""
+        self.hand.set_grasp(physics, close_factors=random_state.uniform())
+        self._place_hand(physics, random_state)
+        self._place_prop(physics, random_state)
+
+    def tool_center_point(self, physics: mjcf.Physics) -> NDArray[np.float64]:
+        """Where the fingers meet, (3,), m."""
+        return np.array(physics.data.site_xpos[self._tcp])
+
+    def prop_position(self, physics: mjcf.Physics) -> NDArray[np.float64]:
+        """Origin of the object's frame, (3,), m."""
+        return np.array(physics.data.xpos[self._prop_body])
+
+    def hand_distance(self, physics: mjcf.Physics) -> float:
+        """From the tool centre point to the object, m."""
+        offset = self.tool_center_point(physics) - self.prop_position(physics)
+        return float(np.linalg.norm(offset))
+
+    def proprio(self, physics: mjcf.Physics, which: ProprioSet = "paper") -> Float32:
+        """What the robot feels of itself.
+
+        Args:
+            physics: the simulation.
+            which: `paper`: sine and cosine of each arm joint's angle (12), the arm's joint
+                velocities in rad/s (6), the fingers' joint angles in rad (3) and velocities in
+                rad/s (3). `full`: also the arm's joint torques (6) as sign(x) log(1 + |x|) of
+                N m, and the pinch site's position in m (3) and rotation matrix (9).
+
+        Returns:
+            float32 (24,) or (42,), as dm_control's observables give them.
+        """
+        data = physics.data
+        angles = data.qpos[self._arm_qpos]
+        parts = [
+            np.stack([np.sin(angles), np.cos(angles)], axis=1).ravel(),
+            data.qvel[self._arm_qvel],
+            data.qpos[self._finger_qpos],
+            data.qvel[self._finger_qvel],
+        ]
+        if which == "full":
+            torques = data.sensordata[self._torques].reshape(-1, 3)
+            along_axis = np.einsum("ij,ij->i", torques, self._arm_axes)
+            parts += [
+                np.sign(along_axis) * np.log1p(np.abs(along_axis)),
+                data.site_xpos[self._tcp],
+                data.site_xmat[self._tcp],
+            ]
+        return np.concatenate(parts, dtype=np.float32, casting="same_kind")
+
+    def state(self, physics: mjcf.Physics) -> Float32:
+        """All that matters, for agents without a camera.
+
+        Returns:
+            float32 (55,): `full` proprioception (42), and the object's position in m (3),
+            orientation as a unit quaternion (4), and linear and angular velocity in m/s and
+            rad/s (6).
+        """
+        prop = physics.data.sensordata[self._prop_sensors].astype(np.float32)
+        return np.concatenate([self.proprio(physics, "full"), prop])
+
+    @abstractmethod
+    def reward_terms(self, physics: mjcf.Physics) -> dict[str, float]:
+        """The reward's terms by name; their sum is the reward, in [0, 1]."""
+
+    @abstractmethod
+    def success(self, physics: mjcf.Physics) -> bool:
+        """Whether the task is solved at this moment."""
+
+    def get_reward(self, physics: mjcf.Physics) -> float:
+        """The sum of `reward_terms`, in [0, 1]."""
+        return sum(self.reward_terms(physics).values())
+
+
+def _addresses(physics: mjcf.Physics, joints: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Where the positions and the velocities of hinge joints lie in qpos and qvel."""
+    model = physics.model
+    return model.jnt_qposadr[joints].copy(), model.jnt_dofadr[joints].copy()
+
+
+def _sensor_slice(physics: mjcf.Physics, sensors: list[Any]) -> NDArray[Any]:
+    """Where the readings of sensors lie in sensordata, one after another."""
+    ids = physics.bind(sensors).element_id
+    starts, sizes = physics.model.sensor_adr[ids], physics.model.sensor_dim[ids]
+    return np.concatenate([np.arange(a, a + n) for a, n in zip(starts, sizes, strict=True)])

@@ -1,0 +1,24 @@
+"""Reach: bring the hand to a brick that lies on the floor."""
+
+from __future__ import annotations
+
+from dm_control import mjcf
+from dm_control.entities import props
+
+from merl.tasks import rewards
+from merl.tasks.jaco import JacoTask
+
+
+class ReachDuplo(JacoTask):
+    """The hand is to be within 5 cm of a 2x4 Duplo brick (dm_control's `reach_duplo`, Eq. 3)."""
+
+    def __init__(self) -> None:
+        super().__init__(prop=props.Duplo())
+
+    def reward_terms(self, physics: mjcf.Physics) -> dict[str, float]:
+        """Eq. 3: `reaching`, in [0, 1]."""
+        return rewards.reach(self.hand_distance(physics))
+
+    def success(self, physics: mjcf.Physics) -> bool:
+        """The tool centre point is within 5 cm of the brick."""
+        return self.hand_distance(physics) <= rewards.REACHING_DISTANCE

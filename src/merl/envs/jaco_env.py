@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from dm_control import mjcf
 from gymnasium import spaces
 from numpy.typing import NDArray
 
@@ -25,7 +24,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def __init__(self, task: JacoTask, config: EnvConfig, render_mode: str | None = None) -> None:
         self.task, self.config, self.render_mode = task, config, render_mode
-        self._physics = _compile(task)
+        self._physics = task.compile()
         self._substeps = task.physics_steps_per_control_step
         low, high = self._physics.model.actuator_ctrlrange.T
         self._action_center, self._action_scale = (high + low) / 2, (high - low) / 2
@@ -112,14 +111,3 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 def _vector(size: int) -> spaces.Box:
     return spaces.Box(-np.inf, np.inf, (size,), np.float32)
-
-
-def _compile(task: JacoTask) -> mjcf.Physics:
-    """The task's physics, compiled once: nothing in the model varies from episode to episode."""
-    random_state = np.random.RandomState(0)
-    for entity in task.root_entity.iter_entities():
-        entity.initialize_episode_mjcf(random_state)
-    physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
-    physics.legacy_step = True
-    task.after_compile(physics, random_state)
-    return physics

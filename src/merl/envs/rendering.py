@@ -7,6 +7,7 @@ not smoothed, so to an agent the two are different cameras.
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import logging
 import os
@@ -76,6 +77,11 @@ class GlRenderer:
 
 
 _opengl_lock = threading.Lock()
+_OPENGL_LIBRARIES = {
+    "egl": ("libEGL.so.1", "libEGL.so"),
+    "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
+    "glfw": (),  # brings its own library
+}
 
 
 def _enable_opengl() -> None:
@@ -84,28 +90,43 @@ def _enable_opengl() -> None:
     Raises:
         MerlError: there is none.
     """
-    render = importlib.import_module("dm_control._render")
+    wanted = os.environ.get("MUJOCO_GL")
+    names = (wanted,) if wanted else ("egl", "osmesa")
+    if not wanted and os.environ.get("DISPLAY"):
+        names = ("glfw", *names)
     with _opengl_lock:
-        if render.BACKEND not in (None, "disabled"):
-            return
-        wanted = os.environ.get("MUJOCO_GL")
-        headless = not os.environ.get("DISPLAY")
-        names = [wanted] if wanted else ["egl", "osmesa"] if headless else ["glfw", "egl", "osmesa"]
-        for name in names:
-            try:
-                with simulator.opengl_backend(name):
-                    importlib.reload(render)
-            except Exception as reason:
-                logger.info("OpenGL through %s does not work: %s", name, reason)
-            else:
-                if render.BACKEND not in (None, "disabled"):
-                    return
+        if not any(_opengl_works(name) for name in names):
+            raise MerlError(
+                f"renderer 'gl' finds no OpenGL (tried {', '.join(names)}): install the Debian "
+                "package libegl1 or libosmesa6, or use --renderer warp, which needs none"
+            )
+
+
+def _opengl_works(name: str) -> bool:
+    """Switch dm_control to a backend, if that can open a context."""
+    render = importlib.import_module("dm_control._render")
+    libraries = _OPENGL_LIBRARIES.get(name, ())
+    if libraries and not any(_loadable(library) for library in libraries):
+        return False
+    try:
+        if name != render.BACKEND:
+            with simulator.opengl_backend(name):
+                importlib.reload(render)
+            render.Renderer(1, 1).free()
+    except Exception as reason:  # each backend fails in its own way
+        logger.info("OpenGL through %s does not work: %s", name, reason)
         with simulator.opengl_backend("disabled"):
             importlib.reload(render)
-        raise MerlError(
-            f"renderer 'gl' finds no OpenGL (tried {', '.join(names)}): install the Debian package "
-            "libegl1 or libosmesa6, or use --renderer warp, which needs none"
-        )
+        return False
+    return True
+
+
+def _loadable(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
 
 
 class WarpRenderer:
@@ -128,6 +149,8 @@ class WarpRenderer:
                 render_depth=False,
                 render_seg=False,
                 use_shadows=True,
+                shadow_light_fraction=0.0,  # this and the sky: what comes closest to OpenGL
+                render_skybox=True,
             )
         self._poses = [(name, getattr(self._data, name).numpy()[0]) for name in _POSES]
         self._pixels = self._context.rgb_data.numpy()[0].view(np.uint8).reshape(size, size, 4)

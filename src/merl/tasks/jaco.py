@@ -94,6 +94,18 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         """The arena, which everything is attached to."""
         return self._arena
 
+    def compile(self) -> mjcf.Physics:
+        """The task's simulation.
+
+        One serves all episodes, because nothing in the model varies from episode to episode.
+        """
+        unused = np.random.RandomState(0)
+        for entity in self._arena.iter_entities():
+            entity.initialize_episode_mjcf(unused)  # sets the size of the brick's studs
+        physics = mjcf.Physics.from_mjcf_model(self._arena.mjcf_model)
+        self.after_compile(physics, unused)
+        return physics
+
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Note where in MuJoCo's arrays the numbers lie that every step reads."""
         del random_state

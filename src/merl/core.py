@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    import torch
+    from gymnasium import spaces
     from torch import Tensor
 
 Observation = Mapping[str, NDArray[Any]]
@@ -27,6 +29,17 @@ class MerlError(Exception):
     Its text is one line that names the thing, the value, and the way out; the command line prints
     it without a traceback and exits with code 2.
     """
+
+
+def is_image(space: spaces.Space[Any]) -> bool:
+    """Whether a modality of this space is an image: a uint8 box of shape (H, W, C)."""
+    return space.dtype == np.uint8 and space.shape is not None and len(space.shape) == 3
+
+
+def is_vector(space: spaces.Space[Any]) -> bool:
+    """Whether a modality of this space is a vector: a float box of shape (n,)."""
+    floats = space.dtype is not None and np.issubdtype(space.dtype, np.floating)
+    return bool(floats) and space.shape is not None and len(space.shape) == 1
 
 
 @dataclass(frozen=True)
@@ -67,6 +80,19 @@ class Batch:
     reward: Tensor
     discount: Tensor
     next_observation: dict[str, Tensor]
+
+    def to(self, device: torch.device) -> Batch:
+        """The same batch on `device`; itself if it is there already."""
+        if self.action.device == device:
+            return self
+        move = {"device": device, "non_blocking": True}
+        return Batch(
+            observation={k: v.to(**move) for k, v in self.observation.items()},
+            action=self.action.to(**move),
+            reward=self.reward.to(**move),
+            discount=self.discount.to(**move),
+            next_observation={k: v.to(**move) for k, v in self.next_observation.items()},
+        )
 
 
 class Agent(Protocol):

@@ -1,0 +1,1 @@
+"""The agents: one learner (`ddpg`), and each agent a short declaration of what it sees (`merl`)."""

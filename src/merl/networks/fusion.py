@@ -1,0 +1,64 @@
+"""Multimodal fusion: what each sense encodes becomes one latent of dimension d (MERL 4.1, C.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from merl.core import MerlError
+
+Squash = Literal["tanh", "simplex"]
+SIMPLEX_GROUP = 8  # features that share one softmax, as in SimNorm (TD-MPC2)
+
+
+class Fusion(nn.Module):
+    """h_psi: per modality Linear, LayerNorm and tanh, concatenated.
+
+    Args:
+        features: the length of each modality's encoding, by key, in the order of concatenation.
+        latent_dim: d, the length of the whole; split evenly over the modalities.
+        layer_norm: whether to normalise (the paper's Figure 3c switches it off).
+        squash: "tanh", or "simplex" for a softmax over groups of eight.
+    """
+
+    def __init__(
+        self,
+        features: Mapping[str, int],
+        latent_dim: int,
+        layer_norm: bool = True,
+        squash: Squash = "tanh",
+    ) -> None:
+        super().__init__()
+        share = latent_dim // len(features)
+        if share * len(features) != latent_dim:
+            raise MerlError(
+                f"agent.latent-dim {latent_dim} does not split evenly over {len(features)} "
+                f"modalities ({', '.join(features)}): use a multiple of {len(features)}"
+            )
+        if squash == "simplex" and share % SIMPLEX_GROUP:
+            raise MerlError(
+                f"agent.squash simplex needs a multiple of {SIMPLEX_GROUP} per modality, "
+                f"not {share}: use agent.latent-dim {SIMPLEX_GROUP * len(features)} or a multiple"
+            )
+        self.squash = squash
+        self.projections = nn.ModuleDict({key: nn.Linear(n, share) for key, n in features.items()})
+        self.norms = nn.ModuleDict(
+            {key: nn.LayerNorm(share) if layer_norm else nn.Identity() for key in features}
+        )
+
+    def forward(self, encoded: Mapping[str, Tensor]) -> Tensor:
+        """Encodings {key: (B, F_key)} to the latent (B, d), each entry in (-1, 1)."""
+        latents = []
+        for key, projection in self.projections.items():
+            projected = projection(encoded[key]).to(projection.weight.dtype)
+            latents.append(self._squash(self.norms[key](projected)))
+        return torch.cat(latents, dim=-1)  # (B, d)
+
+    def _squash(self, latent: Tensor) -> Tensor:
+        if self.squash == "tanh":
+            return torch.tanh(latent)
+        groups = latent.unflatten(-1, (-1, SIMPLEX_GROUP))
+        return torch.softmax(groups, dim=-1).flatten(-2)

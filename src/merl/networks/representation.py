@@ -1,0 +1,53 @@
+"""What an agent sees: one encoder per sense, shared; one fusion for the actor, one for the critic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+from merl.networks.augmentation import shift, to_input
+
+
+class Encoders(nn.Module):
+    """f_xi and g_zeta: an encoder per modality, over images that are shifted when learning.
+
+    Args:
+        images: encoder of each image key.
+        vectors: encoder of each vector key.
+        pad: the random shift, in pixels to each side; 0 is none.
+
+    Attributes:
+        features: the length of each modality's encoding, images first.
+    """
+
+    def __init__(
+        self, images: Mapping[str, nn.Module], vectors: Mapping[str, nn.Module], pad: int
+    ) -> None:
+        super().__init__()
+        self.images = nn.ModuleDict(images)
+        self.vectors = nn.ModuleDict(vectors)
+        self.pad = pad
+        self.features = {key: int(e.features) for key, e in {**images, **vectors}.items()}  # type: ignore[arg-type]
+
+    def forward(
+        self, observation: Mapping[str, Tensor], shifts: Mapping[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        """Encode each modality.
+
+        Args:
+            observation: images uint8 (B, K, H, W, C), vectors float (B, n).
+            shifts: per image key the crop of each sample, int64 (B, 2); None leaves images alone.
+
+        Returns:
+            {key: (B, F_key)}, images first.
+        """
+        dtype = next(self.parameters(), observation[next(iter(observation))]).dtype
+        encoded: dict[str, Tensor] = {}
+        for key, encoder in self.images.items():
+            stack = observation[key]
+            moved = shift(stack, shifts[key], self.pad) if shifts else stack
+            encoded[key] = encoder(to_input(moved, dtype))
+        for key, encoder in self.vectors.items():
+            encoded[key] = encoder(observation[key])
+        return encoded

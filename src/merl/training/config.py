@@ -1,0 +1,93 @@
+"""What a run is: one frozen value that the command line is made from and `config.json` records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from merl.agents.merl import MERLConfig
+from merl.core import MerlError
+from merl.envs.config import EnvConfig
+from merl.replay import ReplayConfig
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """How often the agent shows what it has learnt: without noise, on the same fixed starts."""
+
+    every: int = 10_000
+    """Steps between evaluations."""
+    episodes: int = 10
+    """Episodes of each evaluation."""
+    video: bool = True
+    """Whether to film the first episode of each evaluation."""
+
+    def __post_init__(self) -> None:
+        for name in ("every", "episodes"):
+            if getattr(self, name) < 1:
+                raise MerlError(f"eval.{name} must be at least 1, not {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run; the values are Table 1's."""
+
+    task: Annotated[str, tyro.conf.Positional]
+    """What is to be learnt, e.g. reach_duplo."""
+    preset: str = "paper"
+    """Which set of values the others were taken from."""
+    seed: int = 0
+    """The seed of everything random in the run."""
+    steps: int = 1_000_000
+    """Environment steps."""
+    minutes: float | None = None
+    """Stop after this many minutes of training, if the steps are not done before."""
+    run_dir: Path | None = None
+    """The run's folder; runs/TASK-PRESET-sSEED if not set. It must not exist yet."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the networks live; auto takes CUDA where it is there."""
+    threads: int | None = None
+    """Processor threads of the update; as many as there are cores if not set."""
+    random_steps: int = 2000
+    """Steps of uniformly random actions at the start ("exploration steps" in Table 1)."""
+    seed_steps: int = 4000
+    """Steps before the first update ("seed frames" in Table 1)."""
+    updates_per_step: float = 1.0
+    """Updates for each environment step; below 1, an update every few steps."""
+    save_every: float = 300.0
+    """Seconds between checkpoints; each waits for the end of an episode."""
+    keep: int = 2
+    """How many of the last checkpoints are kept, beside the best."""
+    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    agent: MERLConfig = field(default_factory=MERLConfig)
+    eval: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "keep"):
+            if getattr(self, name) < 1:
+                raise MerlError(f"{name} must be at least 1, not {getattr(self, name)}")
+        for name in ("random_steps", "seed_steps", "seed"):
+            if getattr(self, name) < 0:
+                flag = name.replace("_", "-")
+                raise MerlError(f"{flag} must be at least 0, not {getattr(self, name)}")
+        if self.minutes is not None and not self.minutes > 0:
+            raise MerlError(f"minutes must be above 0, not {self.minutes}")
+        if self.threads is not None and self.threads < 1:
+            raise MerlError(f"threads must be at least 1, not {self.threads}")
+        if not self.updates_per_step >= 0:
+            raise MerlError(f"updates-per-step must be at least 0, not {self.updates_per_step}")
+        if self.replay.batch_size > self.steps:
+            raise MerlError(
+                f"replay.batch-size {self.replay.batch_size} is more than the {self.steps} steps "
+                "of the run, which is all that the replay will hold: use a smaller batch or more "
+                "steps"
+            )
+
+    @property
+    def capacity(self) -> int:
+        """Steps that the replay holds: no more than the run takes."""
+        return min(self.replay.capacity, self.steps)

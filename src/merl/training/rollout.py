@@ -1,0 +1,82 @@
+"""Acting: the stack of frames that an agent sees, and what an episode came to."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from merl.core import Observation
+
+
+class FrameStack:
+    """The last frames of every image, for the one who acts.
+
+    Replay keeps single frames and stacks them itself; this is the same stack at acting time: at
+    an episode's start the first frame is repeated.
+    """
+
+    def __init__(self, frames: int, images: tuple[str, ...], device: torch.device) -> None:
+        self._frames = {key: deque[NDArray[Any]](maxlen=frames) for key in images}
+        self._length = frames
+        self._device = device
+        self._vectors: dict[str, NDArray[Any]] = {}
+
+    def reset(self, observation: Observation) -> None:
+        """Begin an episode."""
+        for key, frames in self._frames.items():
+            frames.extend([observation[key]] * (self._length - 1))
+        self.push(observation)
+
+    def push(self, observation: Observation) -> None:
+        """Take in what a step led to."""
+        for key, frames in self._frames.items():
+            frames.append(observation[key])
+        self._vectors = {k: v for k, v in observation.items() if k not in self._frames}
+
+    def observation(self) -> dict[str, torch.Tensor]:
+        """A batch of one: images uint8 (1, K, H, W, C), vectors (1, n)."""
+        stacked = {key: np.stack(frames)[None] for key, frames in self._frames.items()}
+        stacked |= {key: vector[None] for key, vector in self._vectors.items()}
+        return {key: torch.from_numpy(v).to(self._device) for key, v in stacked.items()}
+
+
+@dataclass
+class Episode:
+    """What an episode came to, step by step.
+
+    Attributes:
+        total_reward: the undiscounted return.
+        length: steps.
+        success: whether the last step was a success; None where the environment does not say.
+        success_any: whether any step was one.
+        terms: each term of the reward, summed.
+    """
+
+    total_reward: float = 0.0
+    length: int = 0
+    success: bool | None = None
+    success_any: bool | None = None
+    terms: dict[str, float] = field(default_factory=dict)
+
+    def add(self, reward: float, info: Mapping[str, Any]) -> None:
+        """Take in one step."""
+        self.total_reward += reward
+        self.length += 1
+        if "success" in info:
+            self.success = bool(info["success"])
+            self.success_any = bool(self.success_any) or self.success
+        for name, value in info.get("reward_terms", {}).items():
+            self.terms[name] = self.terms.get(name, 0.0) + float(value)
+
+    def metrics(self) -> dict[str, float]:
+        """Its numbers by name."""
+        values = {"return": self.total_reward, "length": float(self.length)}
+        if self.success is not None and self.success_any is not None:
+            values |= {"success_end": float(self.success), "success_any": float(self.success_any)}
+        return values | {f"reward/{name}": value for name, value in self.terms.items()}

@@ -20,7 +20,8 @@ import json
 import math
 import mmap
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,9 +113,11 @@ def check_fits(
     Even a replay on disk has to fit into memory: one that does not reads the disk for every sample.
 
     Raises:
-        MerlError: it does not fit; names what it needs, what is there, and what would fit.
+        MerlError: it does not fit: the message names the largest capacity that would. Or it is
+            smaller than one batch.
     """
     steps = config.capacity if capacity is None else capacity
+    _check_batch(config.batch_size, steps)
     room = {"of memory are available": available_memory()}
     if directory is not None:
         where = existing_parent(directory)
@@ -163,26 +166,30 @@ class Replay:
         """
         self.config = config
         self.capacity = config.capacity if capacity is None else capacity
-        _check_batch(config.batch_size, self.capacity)
-        fields = _fields(observation_space, action_space)
         check_fits(
             config, observation_space, action_space, directory=directory, capacity=self.capacity
         )
-        self._slots = _slots(self.capacity, config.frame_stack)
+        fields = _fields(observation_space, action_space)
+        slots = _slots(self.capacity, config.frame_stack)
         self._files: dict[str, mmap.mmap] = {}
-        self._data: dict[str, NDArray[Any]] = {}
+        self._data: dict[str, NDArray[Any]]
         if directory is None:
-            for name, field in fields.items():
-                self._data[name] = np.zeros((self._slots, *field.shape), field.dtype)
+            self._data = {
+                name: np.zeros((slots, *field.shape), field.dtype) for name, field in fields.items()
+            }
         else:
-            self._slots = _prepare(directory, fields, self._slots)
-            for name, field in fields.items():
-                self._files[name] = file = _map(directory / f"{name}.bin")
-                self._data[name] = np.frombuffer(file, field.dtype).reshape(-1, *field.shape)
-        self._keys = list(observation_space.spaces)
-        self._moments = self._steps = self._first = self._gap = 0
-        self._open = False
-        # Step i led away from moment _sources[i mod capacity]; steps _first to _steps - 1 are held.
+            self._files = _open(directory, fields, slots, self.capacity)
+            self._data = {
+                name: np.frombuffer(self._files[name], field.dtype).reshape(-1, *field.shape)
+                for name, field in fields.items()
+            }
+        self._keys = {key: _field_name(key) for key in observation_space.spaces}
+        self._slots = len(self._data["moment"])
+        self._moments = self._steps = 0  # ever written
+        self._first = 0  # the oldest step that can be sampled
+        self._gap = 0  # the newest moment that went missing when the ring was opened again
+        self._open = False  # an episode is in progress
+        # Step i led away from moment _sources[i mod capacity].
         self._sources = np.zeros(self.capacity, np.int64)
         self._take_over(moments=int(self._data["moment"].max()))
 
@@ -218,8 +225,8 @@ class Replay:
             transition.observation,
             position=int(self._data["position"][self._slot(source)]) + 1,
             action=transition.action,
-            reward=transition.reward,
-            discount=transition.discount,
+            reward=float(transition.reward),
+            discount=float(transition.discount),
         )
         self._sources[self._steps % self.capacity] = source
         self._steps += 1
@@ -295,7 +302,7 @@ class Replay:
     ) -> None:
         """Write the next moment; all is checked before anything is changed."""
         data = self._data
-        values = {f"observation.{quote(key, safe='')}": observation.get(key) for key in self._keys}
+        values = {name: observation.get(key) for key, name in self._keys.items()}
         values["action"] = np.zeros_like(data["action"][0]) if action is None else action
         for name, value in values.items():
             _check_value(name, value, data[name])
@@ -355,7 +362,7 @@ class Replay:
         same = np.logical_and.accumulate(same, axis=1)
         m = same.sum(axis=1)
         end = source + m
-        rewards = np.where(same, data["reward"][slots], 0.0)  # float64
+        rewards = np.where(same, data["reward"][slots], 0.0) * gamma**powers  # float64
         discount = gamma**m * data["discount"][(end - 1) % self._slots]
         back = np.arange(self.config.frame_stack)[::-1]
         now = np.maximum(source[:, None] - back, begun[:, None])
@@ -364,15 +371,15 @@ class Replay:
             now=(now - 1) % self._slots,
             then=(then - 1) % self._slots,
             action=slots[:, 0],
-            reward=(rewards @ gamma**powers).astype(np.float32),
+            reward=rewards.sum(axis=1).astype(np.float32),
             discount=discount.astype(np.float32),
         )
 
     def _observation(self, slots: NDArray[np.int64]) -> dict[str, torch.Tensor]:
         """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""
         observation = {}
-        for key in self._keys:
-            array = self._data[f"observation.{quote(key, safe='')}"]
+        for key, name in self._keys.items():
+            array = self._data[name]
             index = slots if array.dtype == np.uint8 else slots[:, -1]
             observation[key] = torch.from_numpy(array.take(index, axis=0))
         return observation
@@ -394,8 +401,8 @@ def _fields(
     """The arrays of the ring, by name."""
     fields: dict[str, _Field] = {}
     for key, space in observation_space.spaces.items():
-        box = isinstance(space, gymnasium.spaces.Box)
         shape = space.shape or ()
+        box = isinstance(space, gymnasium.spaces.Box) and math.prod(shape) > 0
         if box and space.dtype == np.uint8 and len(shape) == 3:
             dtype: np.dtype[Any] = np.dtype("u1")
         elif box and np.issubdtype(space.dtype, np.floating) and len(shape) == 1:
@@ -405,8 +412,8 @@ def _fields(
                 f"observation {key!r} is {space}: replay keeps images, Box(H, W, C) of uint8, and "
                 "vectors, Box(n) of floats; wrap the environment or leave the key out"
             )
-        fields[f"observation.{quote(key, safe='')}"] = _Field(dtype, shape)
-    if len(action_space.shape) != 1:
+        fields[_field_name(key)] = _Field(dtype, shape)
+    if len(action_space.shape) != 1 or not math.prod(action_space.shape):
         raise MerlError(f"the action space is {action_space}: replay keeps vectors, Box(n)")
     fields["action"] = _Field(np.dtype("<f4"), action_space.shape)
     fields["reward"] = _Field(np.dtype("<f4"), ())
@@ -414,6 +421,11 @@ def _fields(
     fields["position"] = _Field(np.dtype("<i4"), ())
     fields["moment"] = _Field(np.dtype("<i8"), ())  # its number; 0 while there is none
     return fields
+
+
+def _field_name(key: str) -> str:
+    """The field of an observation's key; also a file name, so a slash is quoted."""
+    return f"observation.{quote(key, safe='')}"
 
 
 def _check_batch(batch_size: int, capacity: int) -> None:
@@ -461,45 +473,102 @@ def _too_large(
     )
 
 
-def _map(path: Path) -> mmap.mmap:
-    with path.open("r+b") as file:
-        return mmap.mmap(file.fileno(), 0)
+def _open(
+    directory: Path, fields: dict[str, _Field], slots: int, capacity: int
+) -> dict[str, mmap.mmap]:
+    """Create the files, or grow those that are there where they are too short, and map them.
 
-
-def _prepare(directory: Path, fields: dict[str, _Field], slots: int) -> int:
-    """Create the files, or grow those that are there; returns their number of slots."""
+    Raises:
+        MerlError: the disk is full, the directory cannot be written, or it holds something else.
+            What was created is removed again, what was there is as it was.
+    """
     header = directory / _HEADER
-    layout = {name: [field.dtype.str, *field.shape] for name, field in fields.items()}
-    missing = [path for path in (directory, *directory.parents) if not path.exists()]
-    existed = header.exists()
-    if existed:
-        slots = max(slots, _check_header(header, layout, slots))
+    header_text = _header_text(fields, slots, capacity)
+    held = _held_slots(header, fields, slots, header_text)
+    paths = {name: directory / f"{name}.bin" for name in fields}
+    before = {paths[name]: held * field.bytes for name, field in fields.items()}
+    sizes = {paths[name]: max(slots, held) * field.bytes for name, field in fields.items()}
+    new_folders = [path for path in (directory, *directory.parents) if not path.exists()]
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for name, field in fields.items():
-            reserve_file(directory / f"{name}.bin", slots * field.bytes)
-        text = json.dumps({"format": _FORMAT, "slots": slots, "fields": layout}, indent=2)
-        temporary = header.with_suffix(".tmp")
+        for path, size in sizes.items():
+            if not held:  # there without a header: left by a process that died while reserving
+                path.unlink(missing_ok=True)
+            reserve_file(path, size)
+        files = {name: _map(path, sizes[path]) for name, path in paths.items()}
+        if slots > held:
+            _write_text(header, header_text)
+    except BaseException as error:
+        with suppress(OSError):
+            _undo(before, new_folders)
+        if isinstance(error, OSError):
+            why = error.strerror or error
+            raise MerlError(f"cannot keep a replay in {directory}: {why}") from error
+        raise
+    return files
+
+
+def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:
+    """Give files the lengths that they had, remove those that had none, and the new folders."""
+    for path, length in lengths.items():
+        if not length:
+            path.unlink(missing_ok=True)
+        elif path.stat().st_size > length:
+            os.truncate(path, length)
+    for folder in new_folders:
+        folder.rmdir()
+
+
+def _held_slots(header: Path, fields: dict[str, _Field], slots: int, text: str) -> int:
+    """Slots of the ring that lies there, 0 if there is none; checks that it can be gone on with."""
+    if not header.exists():
+        return 0
+    directory, wanted = header.parent, json.loads(text)
+    try:
+        found = json.loads(header.read_text())
+        held = int(found["slots"])
+        same = all(found[name] == wanted[name] for name in ("format", "fields"))
+        whole = all(
+            (directory / f"{name}.bin").stat().st_size >= held * field.bytes
+            for name, field in fields.items()
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise MerlError(f"{directory} holds a damaged replay: give another folder") from error
+    if not same:
+        raise MerlError(
+            f"{directory} holds a replay of other observations or actions: give another folder"
+        )
+    if not whole:
+        raise MerlError(f"{directory} holds a truncated replay: give another folder")
+    if slots > held and np.fromfile(directory / "moment.bin", "<i8", held).max() > held:
+        raise MerlError(
+            f"the replay in {directory} has wrapped and cannot grow: "
+            f"go on with --replay.capacity {found['capacity']}"
+        )
+    return held
+
+
+def _header_text(fields: dict[str, _Field], slots: int, capacity: int) -> str:
+    layout = {
+        name: {"dtype": field.dtype.str, "shape": field.shape} for name, field in fields.items()
+    }
+    header = {"format": _FORMAT, "capacity": capacity, "slots": slots, "fields": layout}
+    return json.dumps(header, indent=2) + "\n"
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Replace the file as a whole, or not at all."""
+    temporary = path.with_suffix(".tmp")
+    try:
         with temporary.open("w") as file:
-            file.write(text + "\n")
+            file.write(text)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(header)
-    except OSError as error:
-        if not existed:
-            for name in fields:
-                (directory / f"{name}.bin").unlink(missing_ok=True)
-            header.with_suffix(".tmp").unlink(missing_ok=True)
-            for path in missing:
-                if path.exists():
-                    path.rmdir()
-        raise MerlError(f"no replay in {directory}: {error.strerror}") from error
-    return slots
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
-def _check_header(header: Path, layout: dict[str, list[Any]], slots: int) -> int:
-    """The slots of the ring that lies there, after a check that it is of this kind."""
-    found = json.loads(header.read_text())
-    if found["format"] != _FORMAT or found["fields"] != layout:
-        raise MerlError(f"{header.parent} holds a replay with other fields: give another folder")
-    return int(found["slots"])
+def _map(path: Path, size: int) -> mmap.mmap:
+    with path.open("r+b") as file:
+        return mmap.mmap(file.fileno(), size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,7 +39,7 @@ def existing_parent(path: Path) -> Path:
 
 
 def reserve_file(path: Path, size: int) -> None:
-    """Make the file `size` bytes long, with every byte of it backed by the disk.
+    """Make the file at least `size` bytes long, with every new byte backed by the disk.
 
     A file that is only given a length is sparse: writing to its memory map on a full disk kills the
     process with SIGBUS. New bytes are zero, old ones are kept.
@@ -47,37 +48,45 @@ def reserve_file(path: Path, size: int) -> None:
         OSError: the disk is full (ENOSPC), a quota is reached, and the like. The file then has the
             length that it had before (0 if it is new).
     """
-    with path.open("ab") as file:
-        before = os.fstat(file.fileno()).st_size
-        if size <= before:
-            return
-        try:
+    # Not in append mode: there neither posix_fallocate's emulation nor pwrite keeps to its offset.
+    file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        before = os.fstat(file).st_size
+        if size > before:
             try:
-                os.posix_fallocate(file.fileno(), before, size - before)
-            except (AttributeError, OSError) as error:
-                unsupported = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
-                if isinstance(error, OSError) and error.errno not in unsupported:
-                    raise
-                file.truncate(before)
-                for start in range(before, size, len(_ZEROS)):
-                    file.write(_ZEROS[: size - start])
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError:
-            os.ftruncate(file.fileno(), before)
+                _allocate(file, before, size)
+            except BaseException:
+                os.ftruncate(file, before)
+                raise
+    finally:
+        os.close(file)
+
+
+def _allocate(file: int, start: int, end: int) -> None:
+    """Reserve the bytes from `start` to `end`, by writing zeros where nothing better is known."""
+    try:
+        os.posix_fallocate(file, start, end - start)
+        return
+    except AttributeError:  # macOS
+        pass
+    except OSError as error:
+        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS):
             raise
+    while start < end:
+        start += os.pwrite(file, _ZEROS[: end - start], start)
+    os.fsync(file)
 
 
 def _machine_memory(root: Path) -> int:
     """MemAvailable where the kernel tells it, else all physical memory."""
     try:
-        lines = (root / "proc/meminfo").read_text().splitlines()
+        text = (root / "proc/meminfo").read_text()
     except OSError:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    sizes = {
-        name: int(rest.split()[0]) for name, _, rest in (line.partition(":") for line in lines)
-    }
-    return 1024 * sizes["MemAvailable"]
+        text = ""
+    found = re.search(r"^MemAvailable:\s+(\d+) kB$", text, re.MULTILINE)
+    if found:
+        return 1024 * int(found[1])
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _cgroup_memory(root: Path) -> Iterator[int]:
@@ -90,14 +99,14 @@ def _cgroup_memory(root: Path) -> Iterator[int]:
     for line in lines:
         _, controllers, name = line.split(":", 2)
         if not controllers:  # version 2
-            files = (mount, "memory.max", "memory.current", "")
+            base, limit, usage, prefix = mount, "memory.max", "memory.current", ""
         elif "memory" in controllers.split(","):
-            files = (mount / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_")
+            base, prefix = mount / "memory", "total_"
+            limit, usage = "memory.limit_in_bytes", "memory.usage_in_bytes"
         else:
             continue
-        base, limit, usage, prefix = files
+        # Inside a container the name may be the one outside of it: then only parents exist here.
         group = base / name.strip("/")
-        # Inside a container the name may be that outside of it: then only the parents exist here.
         for folder in (group, *group.parents):
             if not folder.is_relative_to(base):
                 break
@@ -107,14 +116,14 @@ def _cgroup_memory(root: Path) -> Iterator[int]:
 
 
 def _left_in(limit: Path, usage: Path, stat: Path, prefix: str) -> int | None:
-    """Limit minus use plus file cache; None where there is no limit or no such group."""
+    """Limit minus use plus file cache, in bytes; None where there is no limit or no such group."""
     try:
-        text = limit.read_text().strip()
-        if text == "max":
-            return None
+        most = limit.read_text().strip()
         used = int(usage.read_text())
-        counts = dict(line.split() for line in stat.read_text().splitlines())
+        statistics = stat.read_text()
     except OSError:
         return None
-    cache = sum(int(counts.get(f"{prefix}{kind}_file", 0)) for kind in ("active", "inactive"))
-    return max(0, int(text) - max(0, used - cache))
+    if most == "max":
+        return None
+    counts = re.findall(rf"^{prefix}(?:in)?active_file (\d+)$", statistics, re.MULTILINE)
+    return max(0, int(most) - max(0, used - sum(map(int, counts))))

@@ -1,0 +1,725 @@
+"""Replay against a brute-force account of what was written, and what it does to the disk."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from merl.core import Batch, MerlError, Observation, Transition
+from merl.replay import Replay, ReplayConfig, check_fits, replay_bytes
+
+IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
+OBSERVATIONS = gymnasium.spaces.Dict(
+    {key: gymnasium.spaces.Box(0, 255, shape, np.uint8) for key, shape in IMAGES.items()}
+    | {"joints": gymnasium.spaces.Box(-np.inf, np.inf, (5,), np.float32)}
+)
+ACTIONS = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+
+def config(**values: Any) -> ReplayConfig:
+    return ReplayConfig(**{"capacity": 20, "batch_size": 1, "discount": 0.9} | values)
+
+
+def make(directory: Path | None = None, **values: Any) -> Replay:
+    return Replay(config(**values), OBSERVATIONS, ACTIONS, directory=directory)
+
+
+def observe(episode: int, t: int) -> dict[str, np.ndarray]:
+    """What is seen at moment t of an episode; no two moments and no two pixels are alike."""
+    seen: dict[str, np.ndarray] = {}
+    for salt, (key, shape) in enumerate(IMAGES.items()):
+        pixels = np.arange(np.prod(shape), dtype=np.int64).reshape(shape)
+        seen[key] = ((episode * 37 + t * 101 + pixels * 7 + salt * 53) % 256).astype(np.uint8)
+    seen["joints"] = np.arange(5, dtype=np.float32) + 10 * t + 1000 * episode
+    return seen | {"not kept": np.zeros(3)}
+
+
+def act(episode: int, t: int) -> np.ndarray:
+    """The action of step t, which tells the step."""
+    return np.array([episode, t], np.float32)
+
+
+def pay(episode: int, t: int) -> float:
+    return float(np.float32(np.sin(1 + episode * 13.7 + t * 3.1)))
+
+
+@dataclass
+class Episode:
+    length: int
+    ending: str  # "end": truly over, "limit": truncated, "cut": never said to be over
+
+
+class Every:
+    """Stands in for a random generator: each step that can be drawn comes once, in order."""
+
+    def integers(self, low: int, high: int, size: int) -> np.ndarray:
+        return np.arange(low, high)
+
+
+@dataclass
+class Account:
+    """What a replay must do, told as plainly as can be: lists, loops, one row at a time."""
+
+    config: ReplayConfig
+    moments: list[tuple[int, int]] = field(default_factory=list)  # (episode, t), all ever written
+    ended: set[int] = field(default_factory=set)  # episodes that truly ended
+    lost: int = 0  # so many of the oldest moments are overwritten
+
+    @property
+    def slots(self) -> int:
+        return self.config.capacity + self.config.capacity // 100 + self.config.frame_stack
+
+    def see(self, episode: int, t: int) -> None:
+        self.moments.append((episode, t))
+        self.lost = max(self.lost, len(self.moments) - self.slots)
+
+    def held(self) -> list[tuple[int, int]]:
+        """The steps that must be sampled: the newest, with all of their stack."""
+        alive = set(self.moments[self.lost :])
+        steps = [a for a, b in pairwise(self.moments) if b == (a[0], a[1] + 1)]
+        whole = [(e, t) for e, t in steps if all(frame in alive for frame in self.stack(e, t))]
+        return whole[-self.config.capacity :]
+
+    def stack(self, episode: int, t: int) -> list[tuple[int, int]]:
+        return [(episode, max(0, t - back)) for back in reversed(range(self.config.frame_stack))]
+
+    def row(self, episode: int, t: int) -> tuple[float, float, int]:
+        """Return, discount and the moment that the return bootstraps from."""
+        last = max(s for e, s in self.moments if e == episode)
+        total, weight = 0.0, 1.0
+        for _ in range(self.config.n_step):
+            total += weight * pay(episode, t)
+            weight *= self.config.discount
+            t += 1
+            if t == last:
+                return total, 0.0 if episode in self.ended else weight, t
+        return total, weight, t
+
+
+def write(replay: Replay, account: Account, episode: int, t: int, plan: Episode) -> None:
+    """Moment t of an episode, into both."""
+    if t == 0:
+        replay.begin(observe(episode, 0))
+    else:
+        last = t == plan.length and plan.ending != "cut"
+        ends = last and plan.ending == "end"
+        step = Transition(
+            act(episode, t - 1), pay(episode, t - 1), 1.0 - ends, observe(episode, t), last
+        )
+        replay.add(step)
+        if ends:
+            account.ended.add(episode)
+    account.see(episode, t)
+
+
+def check(replay: Replay, account: Account) -> None:
+    """All that the replay can sample is what the account says, each step once."""
+    held = account.held()
+    assert len(replay) == len(held)
+    if held:
+        check_rows(replay.sample(len(held), Every()), account, held)
+
+
+def check_rows(batch: Batch, account: Account, steps: list[tuple[int, int]]) -> None:
+    def stacked(key: str, episode: int, t: int) -> np.ndarray:
+        return np.stack([observe(*moment)[key] for moment in account.stack(episode, t)])
+
+    assert [tuple(row) for row in batch.action.tolist()] == steps
+    rows = [account.row(*step) for step in steps]
+    np.testing.assert_allclose(batch.reward, [row[0] for row in rows], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(batch.discount, [row[1] for row in rows], rtol=1e-6)
+    ends = [(episode, end) for (episode, _), (_, _, end) in zip(steps, rows, strict=True)]
+    for observation, moments in ((batch.observation, steps), (batch.next_observation, ends)):
+        assert observation.keys() == set(OBSERVATIONS.spaces)
+        for key in IMAGES:
+            np.testing.assert_array_equal(observation[key], [stacked(key, *m) for m in moments])
+        joints = [observe(*moment)["joints"] for moment in moments]
+        np.testing.assert_array_equal(observation["joints"], joints)
+
+
+configs = st.builds(
+    config,
+    capacity=st.integers(1, 12),
+    n_step=st.integers(1, 5),
+    frame_stack=st.integers(1, 4),
+    discount=st.sampled_from([0.0, 0.5, 0.99, 1.0]),
+)
+plans = st.lists(
+    st.builds(Episode, st.integers(0, 9), st.sampled_from(["end", "limit", "cut"])),
+    min_size=1,
+    max_size=6,
+)
+
+
+def brute_force(settings: ReplayConfig, episodes: list[Episode]) -> None:
+    replay = Replay(settings, OBSERVATIONS, ACTIONS)
+    account = Account(settings)
+    for episode, plan in enumerate(episodes):
+        for t in range(plan.length + 1):
+            write(replay, account, episode, t, plan)
+            check(replay, account)  # so at every offset of the write head
+
+
+@settings(max_examples=60, deadline=None)
+@given(configs, plans)
+def test_every_sample_is_what_brute_force_makes_of_it(config, episodes):
+    brute_force(config, episodes)
+
+
+@pytest.mark.long
+@settings(max_examples=1500, deadline=None)
+@given(configs, plans)
+def test_every_sample_is_what_brute_force_makes_of_it_long(config, episodes):
+    brute_force(config, episodes)
+
+
+@pytest.mark.parametrize(
+    ("ending", "rewards", "discounts", "ends"),
+    [
+        # rewards 1, 2, 4, 8; gamma 1/2; three steps
+        ("end", [1 + 1 + 1, 2 + 2 + 2, 4 + 4, 8], [1 / 8, 0, 0, 0], [3, 4, 4, 4]),
+        ("limit", [3, 6, 8, 8], [1 / 8, 1 / 8, 1 / 4, 1 / 2], [3, 4, 4, 4]),
+        ("cut", [3, 6, 8, 8], [1 / 8, 1 / 8, 1 / 4, 1 / 2], [3, 4, 4, 4]),
+        ("in progress", [3, 6, 8, 8], [1 / 8, 1 / 8, 1 / 4, 1 / 2], [3, 4, 4, 4]),
+    ],
+)
+def test_returns_computed_by_hand(ending, rewards, discounts, ends):
+    replay = make(discount=0.5)
+    replay.begin(observe(0, 0))
+    for t, reward in enumerate([1, 2, 4, 8]):
+        over = t == 3 and ending in ("end", "limit")
+        discount = 0.0 if over and ending == "end" else 1.0
+        replay.add(Transition(act(0, t), reward, discount, observe(0, t + 1), over))
+    if ending != "in progress":
+        replay.begin(observe(1, 0))
+        replay.add(Transition(act(1, 0), 1000.0, 1.0, observe(1, 1), last=False))
+    batch = replay.sample(4, Every())
+    assert batch.reward[:4].tolist() == rewards
+    assert batch.discount[:4].tolist() == discounts
+    assert batch.next_observation["joints"][:4, 0].tolist() == [10.0 * t for t in ends]
+
+
+def test_the_batch_has_the_types_and_shapes_of_the_contract():
+    replay, account = make(), Account(config())
+    for t in range(11):
+        write(replay, account, 0, t, Episode(10, "end"))
+    batch = replay.sample(7, np.random.default_rng(0))
+    for observation in (batch.observation, batch.next_observation):
+        assert observation["front"].shape == (7, 3, 3, 4, 3)
+        assert observation["wrist/left"].shape == (7, 3, 2, 2, 1)
+        assert observation["front"].dtype == torch.uint8
+        assert observation["joints"].shape == (7, 5)
+        assert observation["joints"].dtype == torch.float32
+        assert all(tensor.is_contiguous() for tensor in observation.values())
+    assert batch.action.shape == (7, 2)
+    assert batch.reward.shape == batch.discount.shape == (7,)
+    assert {batch.action.dtype, batch.reward.dtype, batch.discount.dtype} == {torch.float32}
+
+
+def test_a_batch_is_the_callers_own():
+    replay, account = make(capacity=4), Account(config(capacity=4))
+    for t in range(5):
+        write(replay, account, 0, t, Episode(50, "end"))
+    batch = replay.sample(4, Every())
+    kept = batch.observation["front"].clone()
+    for t in range(5, 30):
+        write(replay, account, 0, t, Episode(50, "end"))
+    replay.sample(4, Every())
+    assert torch.equal(batch.observation["front"], kept)
+
+
+def test_the_same_generator_and_content_give_the_same_batch():
+    replay, account = make(), Account(config())
+    for t in range(15):
+        write(replay, account, 0, t, Episode(50, "end"))
+    one, two, other = (replay.sample(64, np.random.default_rng(seed)) for seed in (5, 5, 6))
+    assert torch.equal(one.action, two.action)
+    assert torch.equal(one.next_observation["front"], two.next_observation["front"])
+    assert not torch.equal(one.action, other.action)
+
+
+def test_every_step_is_drawn_equally_often():
+    replay, account = make(), Account(config())
+    lengths = [9, 1, 1, 12, 0, 2, 5]
+    for episode, length in enumerate(lengths):
+        for t in range(length + 1):
+            write(replay, account, episode, t, Episode(length, "end"))
+    held = account.held()
+    assert 0 < len(held) < sum(lengths)  # it has wrapped
+    draws = 2000 * len(held)
+    actions = replay.sample(draws, np.random.default_rng(1)).action.tolist()
+    counts = dict.fromkeys(held, 0)
+    for row in actions:
+        counts[tuple(row)] += 1
+    chi_square = sum((count - 2000) ** 2 / 2000 for count in counts.values())
+    assert chi_square < 2.5 * len(held)  # its mean is len(held) - 1; this lies above 99.99 %
+
+
+def test_it_keeps_all_of_its_capacity_and_no_more():
+    settings = config(capacity=1000)
+    replay, account = Replay(settings, OBSERVATIONS, ACTIONS), Account(settings)
+    for episode in range(6):
+        for t in range(251):
+            write(replay, account, episode, t, Episode(250, "limit"))
+            assert len(replay) == min(episode * 250 + t, 1000)
+    check(replay, account)
+
+
+# Going back and opening again
+
+
+class Run:
+    """A replay in a directory and its account, driven together."""
+
+    def __init__(self, directory: Path, **values: Any) -> None:
+        self.directory, self.values = directory, values
+        self.replay = make(directory, **values)
+        self.account = Account(config(**values))
+        self.episode = -1
+
+    def play(self, *lengths: int, ending: str = "end") -> None:
+        for length in lengths:
+            self.episode += 1
+            for t in range(length + 1):
+                write(self.replay, self.account, self.episode, t, Episode(length, ending))
+
+    def go_back(self, state: dict[str, Any], moments: int) -> None:
+        del self.account.moments[moments:]
+        self.replay = make(self.directory, **self.values)
+        self.replay.load_state_dict(state)
+
+
+def test_opened_again_it_holds_all_that_was_written(tmp_path):
+    run = Run(tmp_path / "replay")
+    run.play(5, 4, 6)
+    run.play(3, ending="cut")
+    run.replay = make(run.directory)
+    check(run.replay, run.account)
+    with pytest.raises(ValueError, match="no episode is in progress"):
+        run.replay.add(Transition(act(3, 3), 0.0, 1.0, observe(3, 4), last=False))
+    run.play(7)
+    check(run.replay, run.account)
+
+
+def test_opened_again_after_wrapping(tmp_path):
+    run = Run(tmp_path / "replay")
+    for length in range(9):
+        run.play(length)
+        run.replay = make(run.directory)
+        check(run.replay, run.account)
+
+
+def test_going_on_from_a_state_is_as_if_nothing_had_happened(tmp_path):
+    plain, broken = Run(tmp_path / "plain"), Run(tmp_path / "broken")
+    for run in (plain, broken):
+        run.play(5, 4, 6, 8)
+    # A few steps more, and the process dies.
+    state, moments = json.loads(json.dumps(broken.replay.state_dict())), len(broken.account.moments)
+    episode = broken.episode
+    broken.play(1)
+    broken.go_back(state, moments)
+    broken.episode = episode
+    assert broken.replay.state_dict() == plain.replay.state_dict()
+    for run in (plain, broken):
+        run.play(6, 2)
+        check(run.replay, run.account)
+    assert broken.replay.state_dict() == plain.replay.state_dict()
+    one, two = (run.replay.sample(50, np.random.default_rng(2)) for run in (plain, broken))
+    assert torch.equal(one.action, two.action)
+    assert torch.equal(one.observation["front"], two.observation["front"])
+
+
+def test_an_episode_in_progress_goes_on_from_its_state(tmp_path):
+    run = Run(tmp_path / "replay")
+    run.play(5)
+    run.play(3, ending="cut")
+    run.replay.flush()
+    run.go_back(run.replay.state_dict(), len(run.account.moments))
+    write(run.replay, run.account, 1, 4, Episode(4, "end"))
+    check(run.replay, run.account)
+
+
+def go_back_anywhere(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
+    """Save somewhere, write on, go back, write on again: whatever is held then is right."""
+    replay, account = Replay(settings, OBSERVATIONS, ACTIONS), Account(settings)
+    state, saved = replay.state_dict(), 0
+    for episode, plan in enumerate(episodes):
+        for t in range(plan.length + 1):
+            write(replay, account, episode, t, plan)
+        move = data.draw(st.sampled_from(["go on", "save", "go back"]))
+        if move == "save":
+            state, saved = replay.state_dict(), len(account.moments)
+        elif move == "go back" and saved > account.lost:
+            replay.load_state_dict(state)
+            del account.moments[saved:]
+        check(replay, account)
+
+
+@settings(max_examples=60, deadline=None)
+@given(configs, plans, st.data())
+def test_going_back_anywhere(config, episodes, data):
+    go_back_anywhere(config, episodes, data)
+
+
+@pytest.mark.long
+@settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(configs, plans, st.data())
+def test_going_back_anywhere_long(config, episodes, data):
+    go_back_anywhere(config, episodes, data)
+
+
+def test_what_came_after_a_state_does_not_come_back(tmp_path):
+    run = Run(tmp_path / "replay")
+    run.play(4)
+    state, moments = run.replay.state_dict(), len(run.account.moments)
+    run.play(9)
+    run.go_back(state, moments)
+    run.play(2, ending="cut")  # ends within what was written before
+    run.replay = make(run.directory)
+    check(run.replay, run.account)
+
+
+def test_a_moment_half_written_is_none(tmp_path):
+    class Dies:
+        def __setitem__(self, slot: int, value: float) -> None:
+            raise KeyboardInterrupt
+
+    run = Run(tmp_path / "replay")
+    run.play(30, ending="cut")  # so that an older moment lies where the next will
+    run.replay._data["reward"] = Dies()
+    with pytest.raises(KeyboardInterrupt):
+        run.replay.add(Transition(act(0, 30), 0.0, 1.0, observe(0, 31), last=False))
+    run.account.lost += 1
+    run.replay = make(run.directory)
+    check(run.replay, run.account)
+
+
+def test_a_state_that_is_not_held_is_refused(tmp_path):
+    run = Run(tmp_path / "replay")
+    run.play(5)
+    state = run.replay.state_dict()
+    with pytest.raises(MerlError, match="does not hold moment 6"):
+        make().load_state_dict(state)
+    run.play(20, 20)
+    with pytest.raises(MerlError, match="does not hold moment 6"):
+        run.replay.load_state_dict(state)
+    check(run.replay, run.account)  # and nothing has changed
+
+
+def test_it_grows_when_opened_with_a_larger_capacity(tmp_path):
+    run = Run(tmp_path / "replay")
+    run.play(5, 4, 6)
+    run.values["capacity"] = 50
+    run.account.config = config(capacity=50)
+    run.replay = make(run.directory, capacity=50)
+    assert run.replay.capacity == 50
+    run.play(9, 9, 9, 9, 9)
+    check(run.replay, run.account)
+    with pytest.raises(MerlError, match=r"has wrapped .* --replay.capacity 50$"):
+        make(run.directory, capacity=60)
+
+
+def test_opened_with_a_smaller_capacity_it_samples_only_the_newest(tmp_path):
+    run = Run(tmp_path / "replay")
+    run.play(5, 4, 6)
+    replay = make(run.directory, capacity=7)
+    assert len(replay) == 7
+    steps = run.account.held()[-7:]
+    check_rows(replay.sample(7, Every()), run.account, steps)
+
+
+# Disk and memory
+
+
+def files(directory: Path) -> list[Path]:
+    return sorted(directory.glob("*.bin"))
+
+
+def test_a_step_takes_at_most_21_6_kilobytes(tmp_path):
+    observations = gymnasium.spaces.Dict(
+        {
+            "image": gymnasium.spaces.Box(0, 255, (84, 84, 3), np.uint8),
+            "proprio": gymnasium.spaces.Box(-np.inf, np.inf, (24,), np.float32),
+        }
+    )
+    actions = gymnasium.spaces.Box(-1, 1, (9,), np.float32)
+    settings = ReplayConfig(capacity=1000)
+    replay = Replay(settings, observations, actions, directory=tmp_path)
+    seen = observations.sample()
+    for t in range(1000):
+        if t % 250 == 0:
+            replay.begin(seen)
+        replay.add(Transition(actions.sample(), 0.0, 1.0, seen, last=t % 250 == 249))
+    assert len(replay) == 1000
+    on_disk = sum(file.stat().st_size for file in files(tmp_path))
+    assert on_disk == replay_bytes(settings, observations, actions)
+    in_memory = replay._sources.nbytes
+    million = replay_bytes(settings, observations, actions, 1_000_000) + 1000 * in_memory
+    assert million <= 21_600 * 1_000_000
+
+
+def test_its_files_are_laid_out_as_documented(tmp_path):
+    run = Run(tmp_path)
+    run.play(3)
+    header = json.loads((tmp_path / "replay.json").read_text())
+    assert header["slots"] == 23
+    assert header["fields"]["observation.wrist%2Fleft"] == {"dtype": "|u1", "shape": [2, 2, 1]}
+    assert {file.stem for file in files(tmp_path)} == set(header["fields"])
+    frames = np.fromfile(tmp_path / "observation.front.bin", np.uint8).reshape(23, 3, 4, 3)
+    for t in range(4):
+        np.testing.assert_array_equal(frames[t], observe(0, t)["front"])
+
+
+def assert_reserved(directory: Path) -> None:
+    for file in files(directory):
+        status = file.stat()
+        assert status.st_blocks * 512 >= status.st_size > 0, file
+
+
+def test_its_space_is_reserved_before_it_is_used(tmp_path):
+    make(tmp_path / "replay", capacity=5000)
+    assert_reserved(tmp_path / "replay")
+
+
+def test_space_is_reserved_by_zeros_where_the_file_system_cannot(tmp_path, monkeypatch):
+    def refuse(*_: int) -> None:
+        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    run = Run(tmp_path / "replay", capacity=50_000)
+    assert_reserved(run.directory)
+    run.play(5)
+    check(run.replay, run.account)
+
+
+def test_a_disk_that_runs_full_leaves_nothing_behind(tmp_path, monkeypatch):
+    reserve, calls = os.posix_fallocate, []
+
+    def full(file: int, start: int, size: int) -> None:
+        calls.append(file)
+        if len(calls) == 3:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        reserve(file, start, size)
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(MerlError, match=r"^cannot keep a replay in .*: No space left on device$"):
+        make(tmp_path / "run" / "replay")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_limit_of_the_system_leaves_nothing_behind(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(MerlError, match="File too large"):
+            make(tmp_path / "replay", capacity=5000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_growing_on_a_full_disk_changes_nothing(tmp_path, monkeypatch):
+    run = Run(tmp_path)
+    run.play(5, 4)
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    reserve = os.posix_fallocate
+
+    def full(file: int, start: int, size: int) -> None:
+        reserve(file, start, size)
+        if start == 23 * 8:  # the last field, moment
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(MerlError, match="No space left"):
+        make(tmp_path, capacity=500)
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
+    run.replay = make(tmp_path)
+    check(run.replay, run.account)
+
+
+def test_what_a_dead_process_had_begun_to_reserve_is_replaced(tmp_path):
+    (tmp_path / "moment.bin").write_bytes(b"\1" * 5000)
+    run = Run(tmp_path)
+    assert len(run.replay) == 0
+    run.play(5)
+    check(run.replay, run.account)
+
+
+@pytest.mark.parametrize(
+    ("where", "what"), [("available_memory", "of memory"), ("free_disk", "of disk")]
+)
+def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, where, what):
+    settings = ReplayConfig()
+    room = 30_000_000
+    monkeypatch.setattr(f"merl.replay.{where}", lambda *_: room)
+    directory = tmp_path / "run" / "replay"
+    with pytest.raises(MerlError, match=what) as caught:
+        Replay(settings, OBSERVATIONS, ACTIONS, directory=directory)
+    assert "1,000,000 steps" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+    words = str(caught.value).split()
+    largest = int(words[words.index("--replay.capacity") + 1])
+    assert replay_bytes(settings, OBSERVATIONS, ACTIONS, largest) <= room
+    assert replay_bytes(settings, OBSERVATIONS, ACTIONS, largest + 1) > room
+    check_fits(settings, OBSERVATIONS, ACTIONS, directory=directory, capacity=largest)
+
+
+def test_memory_alone_counts_without_a_directory(monkeypatch):
+    monkeypatch.setattr("merl.replay.free_disk", lambda *_: 0)
+    make()
+    monkeypatch.setattr("merl.replay.available_memory", lambda: 10)
+    with pytest.raises(MerlError, match="free some"):
+        make()
+
+
+def test_opened_again_on_a_disk_that_it_fills_itself(tmp_path, monkeypatch):
+    make(tmp_path)
+    monkeypatch.setattr("merl.replay.free_disk", lambda *_: 0)
+    make(tmp_path)
+    with pytest.raises(MerlError, match="of disk"):
+        make(tmp_path, capacity=25)
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("capacity", 0),
+        ("batch_size", 0),
+        ("n_step", 0),
+        ("frame_stack", -1),
+        ("discount", 1.01),
+        ("discount", float("nan")),
+    ],
+)
+def test_a_config_out_of_range_names_field_and_value(name, value):
+    with pytest.raises(MerlError, match=rf"replay\.{name}\b.* {value}"):
+        ReplayConfig(**{name: value})
+
+
+def test_a_batch_larger_than_the_replay_is_refused():
+    with pytest.raises(MerlError, match=r"batch_size 256 .* of 100 steps"):
+        ReplayConfig(capacity=100)
+    with pytest.raises(MerlError, match=r"batch_size 256 .* of 100 steps"):
+        Replay(ReplayConfig(), OBSERVATIONS, ACTIONS, capacity=100)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gymnasium.spaces.Discrete(3),
+        gymnasium.spaces.Box(0, 255, (4, 4), np.uint8),
+        gymnasium.spaces.Box(0, 1, (4, 4, 3), np.float32),
+        gymnasium.spaces.Box(0, 9, (4,), np.int64),
+        gymnasium.spaces.Box(0, 9, (0,), np.float32),
+    ],
+)
+def test_a_space_that_is_neither_image_nor_vector_is_refused(space):
+    with pytest.raises(MerlError, match="observation 'depth'"):
+        Replay(config(), gymnasium.spaces.Dict({"depth": space}), ACTIONS)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("front", np.zeros((4, 3, 3), np.uint8)),
+        ("front", np.zeros((3, 4, 3), np.float32)),
+        ("front", np.zeros((3, 4, 3), np.uint16)),
+        ("joints", np.zeros(4, np.float32)),
+        ("joints", np.zeros((1, 5), np.float32)),
+        ("joints", np.zeros(5, np.int64)),
+        ("joints", None),
+    ],
+)
+def test_an_observation_that_does_not_fit_its_space_is_refused_whole(key, value):
+    replay, account = make(), Account(config())
+    for t in range(6):
+        write(replay, account, 0, t, Episode(50, "end"))
+    wrong: Observation = observe(0, 6) | {key: value}
+    with pytest.raises(MerlError, match=key):
+        replay.add(Transition(act(0, 5), 0.0, 1.0, wrong, last=False))
+    with pytest.raises(MerlError, match=key):
+        replay.begin(wrong)
+    check(replay, account)
+    write(replay, account, 0, 6, Episode(50, "end"))  # the episode is still in progress
+    check(replay, account)
+
+
+def test_vectors_of_another_float_type_are_taken():
+    replay = make()
+    replay.begin(observe(0, 0) | {"joints": np.arange(5, dtype=np.float64)})
+    replay.add(Transition(np.zeros(2, np.float64), 0, 1, observe(0, 1), last=False))
+    assert replay.sample(1, Every()).observation["joints"].tolist() == [[0, 1, 2, 3, 4]]
+
+
+def test_an_action_of_another_shape_is_refused():
+    replay = make()
+    replay.begin(observe(0, 0))
+    with pytest.raises(MerlError, match="action"):
+        replay.add(Transition(np.zeros(3, np.float32), 0.0, 1.0, observe(0, 1), last=False))
+
+
+def test_calls_out_of_order_are_refused():
+    replay = make()
+    step = Transition(act(0, 0), 0.0, 1.0, observe(0, 1), last=True)
+    with pytest.raises(ValueError, match="empty"):
+        replay.sample(1, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="begin"):
+        replay.add(step)
+    replay.begin(observe(0, 0))
+    with pytest.raises(ValueError, match="empty"):
+        replay.sample(1, np.random.default_rng(0))
+    replay.add(step)
+    with pytest.raises(ValueError, match="begin"):
+        replay.add(step)
+
+
+@pytest.mark.parametrize(("discount", "last"), [(0.0, False), (0.99, False), (0.99, True)])
+def test_a_discount_that_contradicts_the_contract_is_refused(discount, last):
+    replay = make()
+    replay.begin(observe(0, 0))
+    with pytest.raises(ValueError, match="discount"):
+        replay.add(Transition(act(0, 0), 0.0, discount, observe(0, 1), last))
+
+
+def test_a_directory_with_another_replay_is_refused(tmp_path):
+    make(tmp_path)
+    other = gymnasium.spaces.Dict({"joints": OBSERVATIONS["joints"]})
+    with pytest.raises(MerlError, match="other observations"):
+        Replay(config(), other, ACTIONS, directory=tmp_path)
+
+
+def test_a_damaged_directory_is_refused(tmp_path):
+    make(tmp_path)
+    os.truncate(tmp_path / "observation.front.bin", 100)
+    with pytest.raises(MerlError, match="truncated"):
+        make(tmp_path)
+    (tmp_path / "observation.front.bin").unlink()
+    with pytest.raises(MerlError, match="damaged"):
+        make(tmp_path)
+    (tmp_path / "replay.json").write_text("{")
+    with pytest.raises(MerlError, match="damaged"):
+        make(tmp_path)
+
+
+def test_a_file_where_the_directory_should_be_is_refused(tmp_path):
+    (tmp_path / "run").write_text("a file")
+    with pytest.raises(MerlError, match="cannot keep a replay in"):
+        make(tmp_path / "run" / "replay")
+    assert (tmp_path / "run").read_text() == "a file"

@@ -1,4 +1,7 @@
-"""How an agent sees a task: Gymnasium environments, and the renderers behind them."""
+"""How an agent sees a task: Gymnasium environments, and the renderers behind them.
+
+Importing this is cheap; the simulator is loaded when the first environment is made.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,14 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
     Args:
         task: a name of `merl.tasks.TASKS`.
         render_mode: `rgb_array` for `env.render()` to return pictures.
-        config: the fields of `EnvConfig`.
+        **config: the fields of `EnvConfig`: `renderer`, `image_size`, ...
+
+    Returns:
+        The environment, not yet reset; see `merl.envs.jaco_env.JacoEnv`.
 
     Raises:
-        MerlError: the task or a value is unknown.
+        MerlError: the task or a setting is unknown, the renderer does not work here, or the
+            simulator has the wrong version.
     """
     settings = EnvConfig(**config)
     from merl.envs.jaco_env import JacoEnv
@@ -31,6 +38,6 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
 
     if task not in TASKS:
         close = get_close_matches(task, TASKS, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(TASKS)}"
+        hint = f"did you mean {close[0]!r}?" if close else f"choose from {', '.join(TASKS)}"
         raise MerlError(f"task {task!r} is unknown: {hint}")
     return JacoEnv(TASKS[task](), settings, render_mode)

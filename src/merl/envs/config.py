@@ -43,8 +43,10 @@ class EnvConfig:
             _one_of("observations", name, OBSERVATIONS)
         for field in ("image_size", "render_size"):
             size = getattr(self, field)
-            if not isinstance(size, int) or size < SMALLEST_IMAGE:
-                raise MerlError(f"{field} is {size!r}: give a whole number from {SMALLEST_IMAGE}")
+            if type(size) is not int or size < SMALLEST_IMAGE:
+                raise MerlError(
+                    f"{field} is {size!r}: give a whole number, at least {SMALLEST_IMAGE}"
+                )
 
 
 def _one_of(field: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -11,103 +11,163 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError
 from merl.envs.config import EnvConfig
-from merl.envs.rendering import Renderer, make_renderer
-from merl.tasks.jaco import CAMERA, EPISODE_STEPS, PROPRIO_SIZES, JacoTask
+from merl.envs.rendering import Renderer, check_renderer, make_renderer
+from merl.tasks.jaco import CAMERA, CONTROL_TIMESTEP, EPISODE_STEPS, PROPRIO_SIZES, JacoTask
 
-Observation = dict[str, NDArray[Any]]
+Observation = dict[str, Any]
 
 
 class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """One task of the Jaco arm, as an agent sees it."""
+    """One task of the Jaco arm, as an agent sees it.
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
+    An observation is a dict of what `EnvConfig.observations` names: `image` uint8 (H, W, 3),
+    `proprio` float32 (24,) or (42,), `state` float32 (n,). An action is float32 (9,) in [-1, 1]:
+    the velocities of the arm's six joints and of the three fingers, as shares of the greatest.
+
+    An episode is 250 steps of 0.04 s and ends by truncation. `info` holds, after each step,
+    `success` (1.0 if the task is solved at this moment, else 0.0), `distance` (what success is
+    measured by, m) and `reward_terms` (by name; they sum to the reward, which is in [0, 1]).
+
+    Attributes:
+        task: what is to be solved.
+        config: how it is seen.
+    """
+
+    metadata = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1 / CONTROL_TIMESTEP),
+    }
 
     def __init__(self, task: JacoTask, config: EnvConfig, render_mode: str | None = None) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise MerlError(f"render_mode {render_mode!r} is unknown: give 'rgb_array' or None")
+        if render_mode or "image" in config.observations:
+            check_renderer(config.renderer)
         self.task, self.config, self.render_mode = task, config, render_mode
-        self._physics = task.compile()
-        self._substeps = task.physics_steps_per_control_step
+        self._physics: Any = task.compile()
+        self._renderers: dict[int, Renderer] = {}
+        self._steps_left = 0
         low, high = self._physics.model.actuator_ctrlrange.T
         self._action_center, self._action_scale = (high + low) / 2, (high - low) / 2
-        self._renderers: dict[int, Renderer] = {}
-        self._steps = 0
         self.action_space = spaces.Box(-1.0, 1.0, low.shape, np.float32)
-        self.observation_space = self._observation_space()
+        self.observation_space = _observation_space(config, self.task.state(self._physics).size)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; what it starts from depends on the seed alone."""
+        """Start an episode at random.
+
+        Args:
+            seed: with it, the start depends on the seed alone, whatever was done before.
+            options: not used.
+
+        Returns:
+            The first observation, and `info`.
+
+        Raises:
+            MerlError: the environment was closed.
+        """
+        if self._physics is None:
+            raise MerlError("the environment is closed: make another one")
         super().reset(seed=seed)
         random_state = np.random.RandomState(self.np_random.integers(2**32, dtype=np.uint32))
-        random_state.uniform()  # dm_control draws the brick's stud size here, which has no spread
+        # dm_control recompiles the model here, which draws one number and changes nothing.
+        random_state.uniform()
         with self._physics.reset_context():
             self.task.initialize_episode(self._physics, random_state)
-        self._steps = 0
+        self._steps_left = EPISODE_STEPS
         return self._observe(), self._info(self.task.reward_terms(self._physics))
 
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Act for 0.04 s."""
-        self._physics.set_control(self._control(action))
-        self._physics.step(self._substeps)
-        self._steps += 1
+        """Act for 0.04 s.
+
+        Args:
+            action: (9,); what lies outside [-1, 1] is clipped.
+
+        Returns:
+            Observation, reward in [0, 1], terminated (always False), truncated (True at the 250th
+            step), and `info`.
+
+        Raises:
+            MerlError: the action has another shape or is not finite, or no episode is under way;
+                nothing has moved then.
+        """
+        if self._steps_left == 0:
+            raise MerlError("no episode is under way: call reset() first")
+        self._physics.set_control(self._velocities(action))
+        self._physics.step(self.task.physics_steps_per_control_step)
+        self._steps_left -= 1
         terms = self.task.reward_terms(self._physics)
-        truncated = self._steps >= EPISODE_STEPS
+        truncated = self._steps_left == 0
         return self._observe(), sum(terms.values()), False, truncated, self._info(terms)
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """A picture for people."""
+    def render(self) -> NDArray[np.uint8] | None:
+        """A picture for people, uint8 (render_size, render_size, 3), from the agent's camera."""
         return None if self.render_mode is None else self._picture(self.config.render_size)
 
     def close(self) -> None:
-        """Let go of pictures and physics."""
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
-        self._physics.free()
+        """Let go of renderers and physics; may be called twice."""
+        while self._renderers:
+            self._renderers.popitem()[1].close()
+        if self._physics is not None:
+            self._physics.free()
+        self._physics, self._steps_left = None, 0
 
-    def _control(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        values = np.asarray(action, dtype=np.float64)
+    def get_random_state(self) -> dict[str, Any]:
+        """What the episodes to come depend on, as plain types; take it between episodes."""
+        return dict(self.np_random.bit_generator.state)
+
+    def set_random_state(self, state: dict[str, Any]) -> None:
+        """Take back what `get_random_state` gave: `reset()` without a seed starts from there."""
+        self.np_random.bit_generator.state = state
+
+    def _velocities(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Target velocities of the joints, (9,), rad/s."""
+        try:
+            values = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise MerlError(f"action {action!r} is not an array of numbers") from None
         if values.shape != self.action_space.shape:
             raise MerlError(f"action has shape {values.shape}: {self.action_space.shape} is needed")
         if not np.isfinite(values).all():
             raise MerlError(f"action {values.tolist()} is not finite: give numbers in [-1, 1]")
-        return self._action_center + self._action_scale * np.clip(values, -1.0, 1.0)
+        velocities: NDArray[np.float64] = self._action_center + self._action_scale * values.clip(
+            -1.0, 1.0
+        )
+        return velocities
 
     def _observe(self) -> Observation:
+        wanted = self.config.observations
         observation: Observation = {}
-        if "image" in self.config.observations:
+        if "image" in wanted:
             observation["image"] = self._picture(self.config.image_size)
-        if "proprio" in self.config.observations:
+        if "proprio" in wanted:
             observation["proprio"] = self.task.proprio(self._physics, self.config.proprio)
-        if "state" in self.config.observations:
+        if "state" in wanted:
             observation["state"] = self.task.state(self._physics)
         return observation
 
     def _info(self, terms: dict[str, float]) -> dict[str, Any]:
         return {
             "success": float(self.task.success(self._physics)),
-            "distance": self.task.hand_distance(self._physics),
+            "distance": self.task.distance(self._physics),
             "reward_terms": terms,
         }
 
     def _picture(self, size: int) -> NDArray[np.uint8]:
         if size not in self._renderers:
-            self._renderers[size] = make_renderer(
-                self.config.renderer, self._physics, CAMERA.name, size
-            )
+            renderer = make_renderer(self.config.renderer, self._physics, CAMERA.name, size)
+            self._renderers[size] = renderer
         return self._renderers[size].render()
 
-    def _observation_space(self) -> spaces.Dict:
-        size = self.config.image_size
-        everything: dict[str, spaces.Space[Any]] = {
-            "image": spaces.Box(0, 255, (size, size, 3), np.uint8),
-            "proprio": _vector(PROPRIO_SIZES[self.config.proprio]),
-            "state": _vector(self.task.state(self._physics).size),
-        }
-        return spaces.Dict({name: everything[name] for name in self.config.observations})
 
-
-def _vector(size: int) -> spaces.Box:
-    return spaces.Box(-np.inf, np.inf, (size,), np.float32)
+def _observation_space(config: EnvConfig, state_size: int) -> spaces.Space[Observation]:
+    picture = (config.image_size, config.image_size, 3)
+    everything: dict[str, spaces.Space[Any]] = {
+        "image": spaces.Box(0, 255, picture, np.uint8),
+        "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO_SIZES[config.proprio],), np.float32),
+        "state": spaces.Box(-np.inf, np.inf, (state_size,), np.float32),
+    }
+    return spaces.Dict({name: everything[name] for name in config.observations})

@@ -1,8 +1,8 @@
 """Pictures of the scene: two renderers behind one protocol.
 
 `gl` draws as dm_control does, pixel for pixel. `warp` traces rays on the CPU with mujoco-warp and
-needs no OpenGL library; it draws neither sites nor transparency nor reflections, and its edges are
-not smoothed, so to an agent the two are different cameras.
+needs no OpenGL library; it draws neither sites nor transparency nor reflections, and does not
+smooth edges. To an agent the two are different cameras.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import os
 import sys
 import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,10 +32,12 @@ Image = NDArray[np.uint8]
 
 
 class Renderer(Protocol):
-    """Takes pictures of one simulation with one camera."""
+    """Takes square pictures of one simulation with one camera."""
+
+    def __init__(self, physics: Any, camera: str, size: int) -> None: ...
 
     def render(self) -> Image:
-        """The scene as it stands, uint8 (H, W, 3), a new array each time."""
+        """The scene as it stands, uint8 (size, size, 3), a new array each time."""
         ...
 
     def close(self) -> None:
@@ -42,62 +46,74 @@ class Renderer(Protocol):
 
 
 def make_renderer(name: RendererName, physics: Any, camera: str, size: int) -> Renderer:
-    """A renderer for square pictures of `physics`.
+    """A renderer by its name.
 
     Args:
         name: `gl` or `warp`.
-        physics: a `dm_control.mjcf.Physics`.
-        camera: a camera of the model.
+        physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
+        camera: the name of a camera in the model.
         size: height and width of the pictures, in pixels.
 
     Raises:
-        MerlError: `gl` where no OpenGL library can be used.
+        MerlError: `gl`, and no OpenGL library works.
     """
-    return {"gl": GlRenderer, "warp": WarpRenderer}[name](physics, camera, size)
+    renderers: dict[RendererName, type[Renderer]] = {"gl": GlRenderer, "warp": WarpRenderer}
+    return renderers[name](physics, camera, size)
+
+
+def check_renderer(name: RendererName) -> None:
+    """Make sure that a renderer works here, before anything is built on it.
+
+    Raises:
+        MerlError: `gl`, and no OpenGL library works.
+    """
+    if name == "gl":
+        _enable_opengl()
 
 
 class GlRenderer:
-    """OpenGL through dm_control: what its camera observables show."""
+    """OpenGL through dm_control: what its camera observables show.
+
+    The thread that takes the first picture of a physics has to take them all.
+    """
 
     def __init__(self, physics: Any, camera: str, size: int) -> None:
         _enable_opengl()
-        from dm_control.mujoco import engine
-
+        engine = importlib.import_module("dm_control.mujoco.engine")
         self._camera = engine.Camera(physics, height=size, width=size, camera_id=camera)
 
     def render(self) -> Image:
         """See `Renderer`."""
-        return np.array(self._camera.render())
+        return np.array(self._camera.render(), dtype=np.uint8)
 
     def close(self) -> None:
-        """Free the scene; the OpenGL context belongs to the physics."""
+        """Free the scene; the OpenGL context goes with the physics."""
         if self._camera is not None:
             self._camera._scene.free()
-            self._camera = None
+        self._camera = None
 
 
-_opengl_lock = threading.Lock()
 _OPENGL_LIBRARIES = {
-    "egl": ("libEGL.so.1", "libEGL.so"),
+    "egl": ("libEGL.so.1",),
     "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
-    "glfw": (),  # brings its own library
 }
+_opengl_lock = threading.Lock()
 
 
 def _enable_opengl() -> None:
-    """Give dm_control an OpenGL backend, which it was imported without.
+    """Give dm_control, which was imported without, an OpenGL backend.
 
     Raises:
-        MerlError: there is none.
+        MerlError: none works.
     """
     wanted = os.environ.get("MUJOCO_GL")
-    names = (wanted,) if wanted else ("egl", "osmesa")
-    if not wanted and os.environ.get("DISPLAY"):
-        names = ("glfw", *names)
+    on_screen = ("glfw",) if os.environ.get("DISPLAY") else ()
+    names = (wanted,) if wanted else ("egl", *on_screen, "osmesa")
     with _opengl_lock:
         if not any(_opengl_works(name) for name in names):
+            tried = f"MUJOCO_GL={wanted}" if wanted else ", ".join(names)
             raise MerlError(
-                f"renderer 'gl' finds no OpenGL (tried {', '.join(names)}): install the Debian "
+                f"renderer 'gl' finds no OpenGL that works (tried {tried}): install the Debian "
                 "package libegl1 or libosmesa6, or use --renderer warp, which needs none"
             )
 
@@ -105,23 +121,36 @@ def _enable_opengl() -> None:
 def _opengl_works(name: str) -> bool:
     """Switch dm_control to a backend, if that can open a context."""
     render = importlib.import_module("dm_control._render")
+    if name == render.BACKEND and name != "off":
+        return True
     libraries = _OPENGL_LIBRARIES.get(name, ())
-    if libraries and not any(_loadable(library) for library in libraries):
+    if libraries and not any(_loads(library) for library in libraries):
         return False
     try:
-        if name != render.BACKEND:
-            with simulator.opengl_backend(name):
-                importlib.reload(render)
-            render.Renderer(1, 1).free()
-    except Exception as reason:  # each backend fails in its own way
+        _reload_opengl(name)
+        render.Renderer(1, 1).free()
+    except Exception as reason:  # every backend fails in its own way
         logger.info("OpenGL through %s does not work: %s", name, reason)
-        with simulator.opengl_backend("disabled"):
-            importlib.reload(render)
+        _forget_opengl()
+        _reload_opengl("disabled")
         return False
     return True
 
 
-def _loadable(library: str) -> bool:
+def _reload_opengl(name: str) -> None:
+    with simulator.opengl_backend(name):
+        importlib.reload(importlib.import_module("dm_control._render"))
+
+
+def _forget_opengl() -> None:
+    """Undo what a backend that failed left behind, so that another one can be tried."""
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+    for name in list(sys.modules):
+        if name.split(".")[0] == "OpenGL" or name.startswith("dm_control._render.pyopengl."):
+            del sys.modules[name]
+
+
+def _loads(library: str) -> bool:
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -130,71 +159,105 @@ def _loadable(library: str) -> bool:
 
 
 class WarpRenderer:
-    """mujoco-warp's ray tracer, on the CPU whatever else the machine has."""
+    """mujoco-warp's ray tracer, on the CPU whatever else the machine has.
+
+    Physics stays with MuJoCo; for each picture its poses are copied into Warp's arrays.
+    """
 
     def __init__(self, physics: Any, camera: str, size: int) -> None:
-        wp, mjw = _start_warp()
-        self._warp, self._mjw, self._size = wp, mjw, size
+        self._mjw = _start_warp()
         self._source = physics.data.ptr
         model = physics.model.ptr
-        with wp.ScopedDevice("cpu"):
-            self._model = mjw.put_model(model)
-            self._data = mjw.put_data(model, self._source)
-            self._context = mjw.create_render_context(
+        with _warp_on_cpu():
+            self._model = self._mjw.put_model(model)
+            self._data = self._mjw.put_data(model, self._source)
+            self._context = self._mjw.create_render_context(
                 model,
                 nworld=1,
-                cam_res=(size, size),
                 cam_active=[camera],
+                cam_res=(size, size),
                 render_rgb=True,
                 render_depth=False,
                 render_seg=False,
+                # What comes closest to OpenGL's picture:
                 use_shadows=True,
-                shadow_light_fraction=0.0,  # this and the sky: what comes closest to OpenGL
+                shadow_light_fraction=0.0,
                 render_skybox=True,
             )
-        self._poses = [(name, getattr(self._data, name).numpy()[0]) for name in _POSES]
-        self._pixels = self._context.rgb_data.numpy()[0].view(np.uint8).reshape(size, size, 4)
+        # Views, not copies: on the CPU numpy and Warp share the memory.
+        self._poses = {name: getattr(self._data, name).numpy()[0] for name in _POSES}
+        self._bgra = self._context.rgb_data.numpy().view(np.uint8).reshape(size, size, 4)
 
     def render(self) -> Image:
         """See `Renderer`."""
-        for name, target in self._poses:
-            target[:] = getattr(self._source, name).reshape(target.shape)
-        with self._warp.ScopedDevice("cpu"):
+        for name, pose in self._poses.items():
+            pose[:] = getattr(self._source, name).reshape(pose.shape)
+        with _warp_on_cpu():
             self._mjw.refit_bvh(self._model, self._data, self._context)
             self._mjw.render(self._model, self._data, self._context)
-        return self._pixels[:, :, 2::-1].copy()
+            picture: Image = self._bgra[:, :, 2::-1].copy()
+        return picture
 
     def close(self) -> None:
-        """Nothing to free: the arrays go with the object."""
+        """Nothing to do: the arrays go with the renderer."""
 
 
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
-"""What moves between two pictures."""
-_warp_lock = threading.Lock()
+"""What moves from one picture to the next."""
+_warp_lock = threading.RLock()
 
 
-def _start_warp() -> tuple[Any, Any]:
-    """Warp and mujoco-warp, silenced and with a kernel cache that can be written."""
+@contextmanager
+def _warp_on_cpu() -> Iterator[None]:
+    """Run Warp on the CPU; one thread at a time, for the device is a setting of the process."""
+    import warp
+
+    with _warp_lock, warp.ScopedDevice("cpu"):
+        yield
+
+
+def _start_warp() -> Any:
+    """The module mujoco_warp, with Warp silenced and a place for its compiled kernels."""
     with _warp_lock:
-        import warp as wp
-
         if "mujoco_warp" not in sys.modules:
-            wp.config.log_level = wp.LOG_ERROR
-            wp.config.kernel_cache_dir = str(_kernel_cache())
-        import mujoco_warp as mjw
+            import warp
 
-        return wp, mjw
+            warp.config.log_level = warp.LOG_ERROR
+            cache = _kernel_cache()
+            warp.config.kernel_cache_dir = str(cache)
+            if not any(cache.glob(f"{warp.__version__}/*megakernel*")):
+                print("merl: compiling the ray tracer, once, for about 15 s", file=sys.stderr)
+            with _silent_stderr():  # without an NVIDIA driver Warp says so, past Python
+                warp.init()  # type: ignore[no-untyped-call]
+        return importlib.import_module("mujoco_warp")
 
 
 def _kernel_cache() -> Path:
-    """The first of Warp's own cache folder and a temporary one that can be written."""
-    named = os.environ.get("WARP_CACHE_PATH")
-    home = Path(named) if named else Path("~/.cache/merl/warp").expanduser()
-    for folder in (home, Path(tempfile.gettempdir()) / f"merl-warp-{os.getuid()}"):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                return folder
-        except OSError:
-            continue
+    """A folder of our own that can be written: in the user's cache, else among temporary files."""
+    places = [Path(tempfile.gettempdir()) / f"merl-warp-{os.getuid()}"]
+    with suppress(RuntimeError):  # there may be no home
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        places.insert(0, home / "merl" / "warp")
+    if "WARP_CACHE_PATH" in os.environ:
+        places.insert(0, Path(os.environ["WARP_CACHE_PATH"]))
+    for place in places:
+        with suppress(OSError):
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=place):
+                if place.stat().st_uid == os.getuid():  # code is loaded from here
+                    return place
     return Path(tempfile.mkdtemp(prefix="merl-warp-"))
+
+
+@contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Send what C libraries write to stderr nowhere."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with Path(os.devnull).open("w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
+
+# isort: split
 from merl.tasks.jaco import JacoTask
 from merl.tasks.reach_duplo import ReachDuplo
-from merl.tasks.simulator import check_versions
 
 __all__ = ["TASKS", "JacoTask", "ReachDuplo", "check_versions"]
 

@@ -11,16 +11,14 @@ from abc import abstractmethod
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-
-from merl.tasks import simulator  # noqa: F401  (first: it imports dm_control without OpenGL)
-
-# isort: split
 from dm_control import composer, mjcf
 from dm_control.composer import initializers
 from dm_control.composer.variation import distributions
 from dm_control.entities.manipulators import kinova
 from dm_control.manipulation.shared import arenas, cameras, workspaces
+from numpy.typing import NDArray
+
+from merl.tasks.simulator import quiet_inverse_kinematics
 
 CONTROL_TIMESTEP = 0.04
 """Time between two actions, s (dm_control `manipulation.shared.constants`)."""
@@ -64,7 +62,10 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         arm: the Jaco arm, six velocity-controlled joints.
         hand: the Jaco hand, three velocity-controlled fingers.
         prop: the object.
+        success_distance: the task is solved when `distance` is at most this, m.
     """
+
+    success_distance: float
 
     def __init__(self, prop: composer.Entity) -> None:
         self._arena = arenas.Standard()
@@ -124,7 +125,8 @@ class JacoTask(composer.Task):  # type: ignore[misc]
     ) -> None:
         """Draw where fingers, hand and object start, in dm_control's order."""
         self.hand.set_grasp(physics, close_factors=random_state.uniform())
-        self._place_hand(physics, random_state)
+        with quiet_inverse_kinematics():
+            self._place_hand(physics, random_state)
         self._place_prop(physics, random_state)
 
     def tool_center_point(self, physics: mjcf.Physics) -> NDArray[np.float64]:
@@ -183,12 +185,16 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         return np.concatenate([self.proprio(physics, "full"), prop])
 
     @abstractmethod
-    def reward_terms(self, physics: mjcf.Physics) -> dict[str, float]:
-        """The reward's terms by name; their sum is the reward, in [0, 1]."""
+    def distance(self, physics: mjcf.Physics) -> float:
+        """How far the task is from being solved, m."""
 
-    @abstractmethod
     def success(self, physics: mjcf.Physics) -> bool:
         """Whether the task is solved at this moment."""
+        return self.distance(physics) <= self.success_distance
+
+    @abstractmethod
+    def reward_terms(self, physics: mjcf.Physics) -> dict[str, float]:
+        """The reward's terms by name; their sum is the reward, in [0, 1]."""
 
     def get_reward(self, physics: mjcf.Physics) -> float:
         """The sum of `reward_terms`, in [0, 1]."""

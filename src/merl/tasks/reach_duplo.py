@@ -10,15 +10,17 @@ from merl.tasks.jaco import JacoTask
 
 
 class ReachDuplo(JacoTask):
-    """The hand is to be within 5 cm of a 2x4 Duplo brick (dm_control's `reach_duplo`, Eq. 3)."""
+    """Bring the hand to within 5 cm of a 2x4 Duplo brick (dm_control's `reach_duplo`)."""
+
+    success_distance = rewards.REACHING_DISTANCE
 
     def __init__(self) -> None:
         super().__init__(prop=props.Duplo())
 
+    def distance(self, physics: mjcf.Physics) -> float:
+        """From the tool centre point to the brick, m."""
+        return self.hand_distance(physics)
+
     def reward_terms(self, physics: mjcf.Physics) -> dict[str, float]:
         """Eq. 3: `reaching`, in [0, 1]."""
         return rewards.reach(self.hand_distance(physics))
-
-    def success(self, physics: mjcf.Physics) -> bool:
-        """The tool centre point is within 5 cm of the brick."""
-        return self.hand_distance(physics) <= rewards.REACHING_DISTANCE

@@ -1,12 +1,15 @@
-"""The simulator, imported with care: its version checked, and no OpenGL asked for.
+"""The simulator, imported with care: its version is checked and no OpenGL is asked for.
 
-dm_control looks for an OpenGL library while it is imported, and fails where `MUJOCO_GL` names one
-that is not there. Physics needs none, so it is imported with OpenGL switched off; a renderer that
-wants OpenGL switches it on (`merl.envs.rendering`).
+MuJoCo and dm_control look for an OpenGL library while they are imported; where there is none they
+warn, and where `MUJOCO_GL` names one that is missing they fail. Physics needs none, so both are
+imported with OpenGL switched off, unless someone else imported them before; the renderer that wants
+OpenGL switches dm_control's on (`merl.envs.rendering`).
 """
 
 from __future__ import annotations
 
+import importlib
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,8 +17,8 @@ from importlib.metadata import PackageNotFoundError, version
 
 from merl.core import MerlError
 
-PINS = {"mujoco": "3.17.0", "dm_control": "1.0.50"}
-"""The versions that work together; dm_control 1.0.50 fails with mujoco 4 in obscure ways."""
+PINS = {"mujoco": "3.17.0", "dm_control": "1.0.50", "mujoco-warp": "3.17.0"}
+"""The versions that work together: with mujoco 4, dm_control 1.0.50 fails in obscure ways."""
 
 
 def check_versions() -> None:
@@ -28,7 +31,7 @@ def check_versions() -> None:
         try:
             found = version(package)
         except PackageNotFoundError:
-            found = "not installed"
+            found = "none"
         if found != wanted:
             raise MerlError(
                 f"merl needs {package} {wanted}, found {found}: pip install '{package}=={wanted}'"
@@ -37,7 +40,7 @@ def check_versions() -> None:
 
 @contextmanager
 def opengl_backend(name: str) -> Iterator[None]:
-    """Set `MUJOCO_GL` to `name` for as long as something is being imported."""
+    """Set `MUJOCO_GL`, which is read on import, to `name` for a while."""
     before = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = name
     try:
@@ -49,6 +52,22 @@ def opengl_backend(name: str) -> Iterator[None]:
             os.environ["MUJOCO_GL"] = before
 
 
+@contextmanager
+def quiet_inverse_kinematics() -> Iterator[None]:
+    """Drop dm_control's warnings of a pose that it cannot reach: it goes on to draw another."""
+
+    def other(record: logging.LogRecord) -> bool:
+        return not record.getMessage().startswith("Failed to converge")
+
+    logger = logging.getLogger("absl")
+    logger.addFilter(other)
+    try:
+        yield
+    finally:
+        logger.removeFilter(other)
+
+
 check_versions()
 with opengl_backend("disabled"):
-    pass
+    importlib.import_module("mujoco")
+    importlib.import_module("dm_control._render")

@@ -58,7 +58,7 @@ class MetricsWriter:
         self._tail = 0  # byte at which the last row's line begins
         self._file: io.FileIO | None = None  # None: the file is behind memory, rewrite it whole
         self._events: _EventFile | None = None
-        self._guard(self._rewrite)
+        self._guard(lambda: self._rewrite(None))
         self._guard(self._open_events)
 
     def __enter__(self) -> Self:
@@ -101,22 +101,21 @@ class MetricsWriter:
         if last is not None and step < last:
             raise ValueError(f"step {step} comes after step {last}: trim({step}) first")
         numbers = {name: float(value) for name, value in values.items()}
-        new = [name for name in numbers if name not in self._columns]
-        for name in new:
+        for name in numbers:
             if not name or name == "step" or not name.isprintable():
                 raise ValueError(f"a metric cannot be named {name!r}")
+        new = [name for name in numbers if name not in self._columns]
 
-        if step == last:
-            begin = self._tail
-        else:
-            begin = self._end()
+        begin = self._tail if step == last else self._end()
+        file = self._take_file()
+        if step != last:
             self._rows.append({"step": str(int(step))})
         self._rows[-1].update({name: repr(value) for name, value in numbers.items()})
         self._columns += new
-        if new or self._file is None:
-            self._guard(self._rewrite)
+        if new or file is None:
+            self._guard(lambda: self._rewrite(file))
         else:
-            self._guard(lambda: self._put_last_row(begin))
+            self._guard(lambda: self._put_last_row(file, begin))
         self._guard(lambda: self._log_events(step, numbers))
 
     def trim(self, step: int) -> None:
@@ -129,8 +128,9 @@ class MetricsWriter:
         """
         kept = [row for row in self._rows if int(row["step"]) <= step]
         if len(kept) < len(self._rows):
+            file = self._take_file()
             self._rows = kept
-            self._guard(self._rewrite)
+            self._guard(lambda: self._rewrite(file))
             self._guard(lambda: self._forget_events(step))
 
     def close(self) -> None:
@@ -139,7 +139,7 @@ class MetricsWriter:
             return
         self._closed = True
         if self._file is None:
-            self._guard(self._rewrite)
+            self._guard(lambda: self._rewrite(None))
         if self._file is not None:
             self._guard(self._sync)
             self._guard(self._file.close)
@@ -163,26 +163,30 @@ class MetricsWriter:
         assert self._file is not None
         os.fsync(self._file.fileno())
 
+    def _take_file(self) -> io.FileIO | None:
+        """The file, before memory changes; it is put back when it has followed.
+
+        Whatever comes between, an interrupt too, the file then counts as behind.
+        """
+        file, self._file = self._file, None
+        return file
+
     def _end(self) -> int:
         """Bytes in the file now."""
         return 0 if self._file is None else self._file.seek(0, io.SEEK_END)
 
-    def _put_last_row(self, begin: int) -> None:
+    def _put_last_row(self, file: io.FileIO, begin: int) -> None:
         """Write the last row's line at byte `begin`, in one piece; nothing remains behind it."""
-        file = self._file
-        assert file is not None
-        self._file = None  # until this has succeeded, the file is behind memory
         try:
             _write_whole(file, _csv_line(self._cells(self._rows[-1])), begin)
-        except OSError:
+        except BaseException:
             file.close()
             raise
         self._file, self._tail = file, begin
 
-    def _rewrite(self) -> None:
+    def _rewrite(self, old: io.FileIO | None) -> None:
         """Write every row to a temporary file, put it in place of `metrics.csv`, and open that."""
-        if self._file is not None:
-            old, self._file = self._file, None
+        if old is not None:
             old.close()
         self._path.parent.mkdir(parents=True, exist_ok=True)
         lines = [_csv_line(self._columns), *(_csv_line(self._cells(row)) for row in self._rows)]

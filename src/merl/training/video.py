@@ -146,7 +146,8 @@ class VideoWriter:
         if container is not None:
             with contextlib.suppress(OSError):  # the reason is known, or does not matter any more
                 container.close()
-        self._part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self._part.unlink(missing_ok=True)
 
     def _check(self, frame: NDArray[np.uint8]) -> None:
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
@@ -211,9 +212,10 @@ def _captioned(picture: NDArray[np.uint8], caption: Mapping[str, Value]) -> NDAr
     for i, (name, value) in enumerate(caption.items()):
         left, room = margin + i * column, column - margin
         label, text = name.replace("_", " "), _text(value)
-        draw.text((left, margin), label, (205, 210, 216), _font(label, small, room), anchor="lt")
-        baseline = (left, strip - margin)
-        draw.text(baseline, text, (255, 255, 255), _font(text, large, room), anchor="ls")
+        above = (left, margin + small * 0.8)
+        draw.text(above, label, (205, 210, 216), _font(label, small, room), anchor="ls")
+        under = (left, strip - margin)
+        draw.text(under, text, (255, 255, 255), _font(text, large, room), anchor="ls")
     result[-strip:] = np.asarray(below)
     return result
 

@@ -128,7 +128,7 @@ def test_survives_a_kill(tmp_path):
 
 def test_trim_leaves_no_step_twice(tmp_path):
     with MetricsWriter(tmp_path) as writer:
-        for step in (100, 200, 300):
+        for step in (100, 200, 201, 300):
             writer.write(step, {"a": step})
     with MetricsWriter(tmp_path) as writer:
         writer.trim(200)

@@ -63,6 +63,7 @@ def test_a_step_has_one_row(tmp_path):
         writer.write(0, {"a": 1.0, "b": 1.0})
         writer.write(1, {"a": 1.23456789, "b": 1.23456789})
         writer.write(1, {"a": 2.0, "b": 2.0})  # shorter: nothing of the longer line may remain
+        assert rows(tmp_path)[1:] == [["0", "1.0", "1.0"], ["1", "2.0", "2.0"]]
         writer.write(1, {"c": 3.0})
         writer.write(2, {"a": 4.0})
         writer.write(2, {"b": 5.0})

@@ -14,11 +14,10 @@ import io
 import logging
 import os
 import socket
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import ModuleType, TracebackType
+from types import TracebackType
 from typing import Any, Self
 
 from merl.core import MerlError
@@ -227,11 +226,10 @@ class _EventFile:
 
     TensorBoard's own `EventFileWriter`, which is under torch's `SummaryWriter`, writes from a
     background thread; on a full disk that thread dies with a traceback across the live view. Its
-    record format is used directly instead.
+    record format is used directly instead; that leaves an installed TensorFlow alone, too.
     """
 
     def __init__(self, folder: Path) -> None:
-        _keep_tensorflow_out()
         from tensorboard.compat.proto import event_pb2, summary_pb2  # type: ignore[import-untyped]
         from tensorboard.summary.writer.record_writer import (  # type: ignore[import-untyped]
             RecordWriter,
@@ -269,16 +267,6 @@ class _EventFile:
         record = io.BytesIO()
         self._record_writer(record).write(event.SerializeToString())
         _write_whole(self._file, record.getvalue(), self._file.seek(0, io.SEEK_END))
-
-
-def _keep_tensorflow_out() -> None:
-    """Tell TensorBoard to use its own file code, even where TensorFlow is installed.
-
-    `tensorboard.compat` takes TensorFlow if it finds it, which costs seconds and prints; it looks
-    for a module of this name first.
-    """
-    name = "tensorboard.compat.notf"
-    sys.modules.setdefault(name, ModuleType(name))
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:

@@ -45,6 +45,8 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             check_renderer(config.renderer)
         self.task, self.config, self.render_mode = task, config, render_mode
         self._physics: Any = task.compile()
+        buffer = self._physics.model.vis.global_  # OpenGL's, which has to hold every picture
+        buffer.offwidth = buffer.offheight = max(config.image_size, config.render_size)
         self._renderers: dict[int, Renderer] = {}
         self._steps_left = 0
         low, high = self._physics.model.actuator_ctrlrange.T

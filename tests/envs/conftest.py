@@ -1,0 +1,1 @@
+import merl.tasks  # noqa: F401  (before dm_control: it keeps the import from looking for OpenGL)

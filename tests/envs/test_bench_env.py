@@ -1,0 +1,37 @@
+"""The bench runs and says what it measured; the figures themselves are not tested."""
+
+import json
+
+from rich.console import Console
+
+from merl.bench import env as bench
+from merl.core import MerlError
+
+
+def text_of(result):
+    console = Console(width=200)
+    with console.capture() as capture:
+        console.print(bench.table(result))
+    return capture.get()
+
+
+def test_every_side_is_timed():
+    result = bench.run(repeats=2, steps=6, image_size=32)
+    assert json.loads(json.dumps(result)) == result
+    shown = text_of(result)
+    sides = [bench.OURS, bench.BLIND] + ([] if "skipped" in result else [bench.THEIRS])
+    for side in sides:
+        rate = result["steps_per_s"][side]
+        assert 0 < rate["low"] <= rate["median"] <= rate["high"]
+        assert side in shown
+
+
+def test_without_opengl_that_side_is_left_out(monkeypatch):
+    def missing(_):
+        raise MerlError("no OpenGL here")
+
+    monkeypatch.setattr(bench, "check_renderer", missing)
+    result = bench.run(repeats=1, steps=2, image_size=16)
+    assert "ratio" not in result
+    assert bench.THEIRS not in result["steps_per_s"]
+    assert "no OpenGL here" in text_of(result)

@@ -1,0 +1,215 @@
+"""The environment as Gymnasium and an agent see it."""
+
+import warnings
+from dataclasses import fields
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from merl.core import MerlError
+from merl.envs import EnvConfig, make_env
+from merl.envs.registration import ENV_IDS, register
+from merl.tasks import TASKS
+
+ACTION = np.zeros(9, np.float32)
+
+
+@pytest.fixture(scope="module")
+def blind():
+    """An environment without pictures, which is fast."""
+    env = make_env("reach_duplo", renderer="warp", observations=("proprio", "state"))
+    yield env
+    env.close()
+
+
+def same(one, other):
+    return all(np.array_equal(one[key], other[key]) for key in one) and one.keys() == other.keys()
+
+
+def episode(env, steps=5, action_seed=0, **reset):
+    noise = np.random.RandomState(action_seed)
+    seen = [env.reset(**reset)[0]]
+    for _ in range(steps):
+        seen.append(env.step(noise.uniform(-1, 1, 9).astype(np.float32))[0])
+    return seen
+
+
+@pytest.mark.parametrize("proprio", ["paper", "full"])
+def test_gymnasium_finds_nothing_wrong(proprio):
+    config = {"proprio": proprio, "observations": ("image", "proprio", "state")}
+    env = make_env("reach_duplo", renderer="warp", image_size=32, render_mode="rgb_array", **config)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for known in ("Box observation space m", "environment not having a spec"):
+            warnings.filterwarnings("ignore", message=f".*{known}")
+        check_env(env)
+    env.close()
+
+
+def test_spaces():
+    env = make_env("reach_duplo", renderer="warp", observations=("image", "proprio", "state"))
+    spaces = env.observation_space.spaces
+    assert {key: (space.shape, space.dtype) for key, space in spaces.items()} == {
+        "image": ((84, 84, 3), np.uint8),
+        "proprio": ((24,), np.float32),
+        "state": ((55,), np.float32),
+    }
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (9,), np.float32)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    env.close()
+
+
+def test_a_seed_alone_decides_the_start(blind):
+    first = episode(blind, seed=7)
+    blind.reset()
+    blind.step(ACTION)
+    other = episode(blind, seed=8)
+    again = episode(blind, seed=7)
+    assert all(same(a, b) for a, b in zip(first, again, strict=True))
+    assert not same(first[0], other[0])
+    with_picture = make_env("reach_duplo", renderer="warp", observations=("image", "state"))
+    elsewhere = episode(with_picture, seed=7)
+    assert all(
+        np.array_equal(a["state"], b["state"]) for a, b in zip(first, elsewhere, strict=True)
+    )
+    with_picture.close()
+
+
+def test_episodes_differ_and_can_be_taken_up_again(blind):
+    blind.reset(seed=1)
+    state = blind.get_random_state()
+    second, third = episode(blind), episode(blind)
+    assert not same(second[0], third[0])
+    another = make_env("reach_duplo", renderer="warp", observations=("proprio", "state"))
+    another.set_random_state(state)
+    assert all(same(a, b) for a, b in zip(second, episode(another), strict=True))
+    assert all(same(a, b) for a, b in zip(third, episode(another), strict=True))
+    another.close()
+
+
+def test_an_episode_ends_by_truncation_at_250_steps(blind):
+    blind.reset(seed=0)
+    for step in range(1, 251):
+        _, reward, terminated, truncated, _ = blind.step(ACTION)
+        assert isinstance(reward, float)
+        assert terminated is False
+        assert truncated is (step == 250)
+    with pytest.raises(MerlError, match="reset"):
+        blind.step(ACTION)
+
+
+def test_info_tells_success_distance_and_terms(blind):
+    _, info = blind.reset(seed=0)
+    assert set(info) == {"success", "distance", "reward_terms"}
+    physics, task = blind._physics, blind.task
+    for distance in (0.03, 0.07):
+        blind.reset(seed=0)
+        physics.data.qpos[-7:-4] = task.tool_center_point(physics) - (0.0, 0.0, distance)
+        physics.forward()
+        _, reward, _, _, info = blind.step(ACTION)
+        assert info["success"] == float(info["distance"] <= 0.05)
+        assert info["success"] == (distance < 0.05)
+        assert reward == sum(info["reward_terms"].values())
+
+
+def test_actions_are_joint_velocities_and_clipped(blind):
+    blind.reset(seed=0)
+    control = blind._physics.data.ctrl
+    greatest = blind._physics.model.actuator_ctrlrange[:, 1]
+    for action, share in ((ACTION + 1, 1.0), (ACTION - 0.5, -0.5), (ACTION + 1.2, 1.0)):
+        blind.step(action)
+        np.testing.assert_allclose(control, share * greatest)
+    assert greatest[:6] == pytest.approx(np.deg2rad([36, 36, 36, 48, 48, 48]))
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(8), r"shape \(8,\)"),
+        (np.zeros((1, 9)), r"shape \(1, 9\)"),
+        (np.full(9, np.nan), "not finite"),
+        (np.array([np.inf] + [0.0] * 8), "not finite"),
+        (["a"] * 9, "not an array of numbers"),
+        (None, "shape"),
+    ],
+)
+def test_a_bad_action_moves_nothing(blind, action, message):
+    blind.reset(seed=0)
+    before = blind._physics.get_state()
+    with pytest.raises(MerlError, match=message) as error:
+        blind.step(action)
+    assert "\n" not in str(error.value)
+    np.testing.assert_array_equal(blind._physics.get_state(), before)
+
+
+@pytest.mark.parametrize(
+    ("task", "config", "message"),
+    [
+        ("reach_dupol", {}, "did you mean 'reach_duplo'"),
+        ("walk", {}, "choose from reach_duplo"),
+        (
+            "reach_duplo",
+            {"renderer": "vulkan"},
+            "'vulkan' is unknown: choose from gl, warp",
+        ),
+        ("reach_duplo", {"proprio": "some"}, "proprio 'some' is unknown"),
+        ("reach_duplo", {"image_size": 15}, "image_size is 15: .* at least 16"),
+        ("reach_duplo", {"image_size": 84.0}, "image_size is 84.0"),
+        ("reach_duplo", {"render_size": 0}, "render_size is 0"),
+        ("reach_duplo", {"observations": ()}, "observations is empty"),
+        ("reach_duplo", {"observations": ("sound",)}, "'sound' is unknown"),
+        ("reach_duplo", {"renderer": "warp", "render_mode": "human"}, "render_mode 'human'"),
+    ],
+)
+def test_a_bad_setting_gets_one_clear_line(task, config, message):
+    with pytest.raises(MerlError, match=message) as error:
+        make_env(task, **config)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_not_asked_for_is_not_computed(blind, monkeypatch):
+    def refuse(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(blind, "_picture", refuse)
+    observation, _ = blind.reset(seed=0)
+    assert list(observation) == ["proprio", "state"]
+    env = make_env("reach_duplo", renderer="warp", image_size=16, observations=("image",))
+    monkeypatch.setattr(env.task, "proprio", refuse)
+    assert list(env.reset(seed=0)[0]) == ["image"]
+    env.close()
+
+
+def test_closed_for_good():
+    env = make_env("reach_duplo", renderer="warp", observations=("state",))
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    with pytest.raises(MerlError, match="closed"):
+        env.reset()
+    with pytest.raises(MerlError, match="reset"):
+        env.step(ACTION)
+
+
+def test_gymnasium_makes_every_task():
+    register()
+    register()
+    assert set(ENV_IDS) == set(TASKS)
+    settings = {"renderer": "warp", "observations": ("state",), "proprio": "full"}
+    env = gymnasium.make("merl/ReachDuplo-v0", **settings)
+    assert env.unwrapped.config == EnvConfig(**settings)
+    assert env.reset(seed=0)[0]["state"].shape == (55,)
+    env.close()
+
+
+def test_every_setting_is_a_plain_value():
+    assert {field.name: field.default for field in fields(EnvConfig)} == {
+        "renderer": "gl",
+        "image_size": 84,
+        "proprio": "paper",
+        "observations": ("image", "proprio"),
+        "render_size": 480,
+    }

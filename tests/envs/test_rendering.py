@@ -1,0 +1,226 @@
+"""Both renderers, together and each where the other cannot be."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from dm_control import manipulation
+
+from merl.core import MerlError
+from merl.envs import make_env
+from merl.envs.rendering import check_renderer
+
+NO_OPENGL = "no OpenGL library works on this machine"
+
+
+@pytest.fixture(scope="module")
+def opengl():
+    try:
+        check_renderer("gl")
+    except MerlError:
+        pytest.skip(NO_OPENGL)
+
+
+@pytest.fixture(scope="module")
+def warp_env():
+    env = make_env("reach_duplo", renderer="warp", render_mode="rgb_array")
+    env.reset()  # compiles, so that interpreters started later have nothing to say
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def gl_env(opengl):
+    env = make_env("reach_duplo", renderer="gl", render_mode="rgb_array")
+    yield env
+    env.close()
+
+
+def run(code, **environment):
+    """Run code in a fresh interpreter, where no variable chooses an OpenGL."""
+    inherited = {name: value for name, value in os.environ.items() if "GL" not in name}
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        env={**inherited, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+STEP = """
+from merl.envs import make_env
+env = make_env("reach_duplo", renderer="{renderer}", render_mode="rgb_array")
+observation, _ = env.reset(seed=0)
+observation, *_ = env.step(env.action_space.sample())
+assert observation["image"].std() > 20
+assert env.render().shape == (480, 480, 3)
+"""
+
+
+def test_gl_is_dm_controls_camera_bit_for_bit(gl_env):
+    theirs = manipulation.load("reach_duplo_vision")
+    spec = theirs.action_spec()
+    noise = np.random.RandomState(0)
+    for seed in range(2):
+        observation, _ = gl_env.reset(seed=seed)
+        # The number that our reset drew is where dm_control's episode starts.
+        start = np.random.default_rng(seed).integers(2**32, dtype=np.uint32)
+        theirs._random_state = np.random.RandomState(start)
+        timestep = theirs.reset()
+        np.testing.assert_array_equal(observation["image"], timestep.observation["front_close"][0])
+        action = noise.uniform(-1, 1, 9)
+        timestep = theirs.step(spec.minimum + (action + 1) / 2 * (spec.maximum - spec.minimum))
+        observation = gl_env.step(action)[0]
+        np.testing.assert_array_equal(observation["image"], timestep.observation["front_close"][0])
+    theirs.close()
+
+
+def test_warp_is_close_to_gl(gl_env, warp_env):
+    for seed in range(3):
+        drawn = gl_env.reset(seed=seed)[0]["image"].astype(int)
+        traced = warp_env.reset(seed=seed)[0]["image"].astype(int)
+        assert np.abs(drawn - traced).mean() < 8.0
+
+
+def red(picture):
+    """Pixels of the brick's colour, (H, W) bool."""
+    r, g, b = np.moveaxis(picture.astype(int), -1, 0)
+    return (r > 120) & (g < 60) & (b < 60)
+
+
+def black(picture):
+    """Pixels of the arm's colour, (H, W) bool."""
+    return (picture < 40).all(axis=-1)
+
+
+@pytest.mark.parametrize("renderer", ["warp", "gl"])
+def test_brick_and_arm_are_in_the_picture(renderer, request):
+    env = request.getfixturevalue(f"{renderer}_env")
+    for seed in range(5):
+        small = env.reset(seed=seed)[0]["image"]
+        large = env.render()
+        assert small.shape == (84, 84, 3)
+        assert large.shape == (480, 480, 3)
+        for picture in (small, large):
+            assert red(picture).sum() >= picture.shape[0] ** 2 * 3e-4  # the hand may cover some
+            assert black(picture).mean() > 0.02
+        # The camera looks along +y: a brick further to the right is further to the right here.
+        column = np.nonzero(red(large))[1].mean() / 480 - 0.5
+        across = env.task.prop_position(env._physics)[0]
+        assert abs(column - across) < 0.15
+
+
+def test_pictures_are_new_arrays_and_follow_the_arm(warp_env):
+    first = warp_env.reset(seed=0)[0]["image"]
+    kept = first.copy()
+    for _ in range(10):
+        later = warp_env.step(np.ones(9, np.float32))[0]["image"]
+    np.testing.assert_array_equal(first, kept)
+    assert (first != later).mean() > 0.02
+    np.testing.assert_array_equal(warp_env.reset(seed=0)[0]["image"], kept)
+
+
+def test_two_threads_see_what_one_sees():
+    def pictures(seed):
+        env = make_env("reach_duplo", renderer="warp", image_size=32)
+        seen = [env.reset(seed=seed)[0]["image"]]
+        seen += [env.step(np.ones(9, np.float32))[0]["image"] for _ in range(10)]
+        env.close()
+        return np.stack(seen)
+
+    with ThreadPoolExecutor(2) as threads:
+        together = list(threads.map(pictures, [0, 1]))
+    for seed, seen in enumerate(together):
+        np.testing.assert_array_equal(seen, pictures(seed))
+
+
+@pytest.mark.parametrize("size", [16, 700])
+@pytest.mark.parametrize("renderer", ["warp", "gl"])
+def test_any_size(renderer, size, request):
+    if renderer == "gl":
+        request.getfixturevalue("opengl")
+    env = make_env("reach_duplo", renderer=renderer, image_size=16, render_size=size,
+                   render_mode="rgb_array")  # fmt: skip
+    assert env.reset(seed=0)[0]["image"].shape == (16, 16, 3)
+    assert env.render().shape == (size, size, 3)
+    env.close()
+
+
+def test_warp_needs_no_opengl_and_says_nothing_at_exit(warp_env):
+    done = run(STEP.format(renderer="warp"), MUJOCO_GL="disabled")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_warp_works_where_the_opengl_asked_for_is_missing(warp_env):
+    done = run(HIDE_OPENGL + STEP.format(renderer="warp"), MUJOCO_GL="egl")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+HIDE_OPENGL = """
+import ctypes, ctypes.util
+load, find = ctypes.CDLL.__init__, ctypes.util.find_library
+def hidden(name):
+    return any(part in str(name) for part in ("EGL", "OSMesa", "GL", "glfw"))
+def load_others(self, name=None, *args, **kwargs):
+    if name and hidden(name):
+        raise OSError(f"{name}: hidden")
+    load(self, name, *args, **kwargs)
+ctypes.CDLL.__init__ = load_others
+ctypes.util.find_library = lambda name: None if hidden(name) else find(name)
+"""
+
+
+def test_gl_without_opengl_names_the_way_on():
+    code = """
+    from merl.core import MerlError
+    from merl.envs import make_env
+    try:
+        make_env("reach_duplo", renderer="gl")
+    except MerlError as error:
+        print(error)
+    make_env("reach_duplo", renderer="gl", observations=("state",)).reset(seed=0)
+    """
+    done = run(HIDE_OPENGL + textwrap.dedent(code))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(done.stdout.splitlines()) == 1
+    for word in ("libegl1", "libosmesa6", "--renderer warp"):
+        assert word in done.stdout
+
+
+def test_gl_says_nothing_at_exit_without_close(opengl):
+    done = run(STEP.format(renderer="gl"))
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_gl_after_warp_in_one_process(opengl, warp_env):
+    done = run(STEP.format(renderer="warp") + STEP.format(renderer="gl"))
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_warp_works_without_a_home_and_says_when_it_compiles(tmp_path):
+    code = "from merl.envs import rendering; rendering._start_warp(); import warp;"
+    code += "print(warp.config.kernel_cache_dir)"
+    home = tmp_path / "a file, so that no folder can be made in it"
+    home.touch()
+    settings = {"HOME": str(home), "XDG_CACHE_HOME": "", "TMPDIR": str(tmp_path)}
+    done = run(code, **settings)
+    assert done.returncode == 0
+    assert done.stdout.startswith(str(tmp_path))
+    assert done.stderr == "merl: compiling the ray tracer, once, for about 15 s\n"
+
+
+def test_importing_the_room_loads_no_simulator():
+    done = run(
+        """
+        import sys
+        import merl.envs, merl.envs.registration
+        print({"torch", "mujoco", "dm_control", "warp"} & set(sys.modules))
+        """
+    )
+    assert (done.stdout.strip(), done.stderr) == ("set()", "")

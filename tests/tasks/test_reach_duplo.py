@@ -1,0 +1,146 @@
+"""The task against dm_control's own `reach_duplo`."""
+
+import numpy as np
+import pytest
+from dm_control import manipulation
+
+from merl.core import MerlError
+from merl.tasks import TASKS, ReachDuplo, jaco, simulator
+
+
+class Episodes:
+    """Our task, started in the way of `JacoEnv`: one physics for all episodes."""
+
+    def __init__(self):
+        self.task = ReachDuplo()
+        self.physics = self.task.compile()
+
+    def start(self, seed):
+        random_state = np.random.RandomState(seed)
+        random_state.uniform()
+        with self.physics.reset_context():
+            self.task.initialize_episode(self.physics, random_state)
+        return self.physics
+
+
+@pytest.fixture(scope="module")
+def ours():
+    return Episodes()
+
+
+@pytest.fixture(scope="module")
+def theirs():
+    """dm_control's task, which recompiles the model in every episode."""
+    environment = manipulation.load("reach_duplo_features")
+
+    def start(seed):
+        environment._random_state = np.random.RandomState(seed)
+        return environment, environment.reset()
+
+    return start
+
+
+def assert_same_start(ours, theirs, seed):
+    physics = ours.start(seed)
+    reference = theirs(seed)[0].physics
+    np.testing.assert_allclose(physics.data.qpos, reference.data.qpos, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(physics.data.qvel, reference.data.qvel, rtol=0, atol=1e-6)
+
+
+def test_starts_are_those_of_dm_control(ours, theirs):
+    for seed in range(5):
+        assert_same_start(ours, theirs, seed)
+
+
+@pytest.mark.long
+def test_a_hundred_starts_are_those_of_dm_control(ours, theirs):
+    for seed in range(100):
+        assert_same_start(ours, theirs, seed)
+
+
+def test_motion_and_proprioception_are_those_of_dm_control(ours, theirs):
+    physics = ours.start(0)
+    environment, timestep = theirs(0)
+    spec = environment.action_spec()
+    noise = np.random.RandomState(0)
+    keys = ["joints_pos", "joints_vel", "jaco_hand/joints_pos", "jaco_hand/joints_vel"]
+    keys += ["joints_torque", "jaco_hand/pinch_site_pos", "jaco_hand/pinch_site_rmat"]
+    prop = ["position", "orientation", "linear_velocity", "angular_velocity"]
+    for _ in range(10):
+        expected = [timestep.observation["jaco_arm/" + key].ravel() for key in keys]
+        expected += [timestep.observation["duplo2x4/" + key].ravel() for key in prop]
+        state = ours.task.state(physics)
+        np.testing.assert_allclose(state, np.concatenate(expected), rtol=1e-6, atol=1e-7)
+        np.testing.assert_array_equal(ours.task.proprio(physics, "full"), state[:42])
+        np.testing.assert_array_equal(ours.task.proprio(physics), state[:24])
+        action = noise.uniform(spec.minimum, spec.maximum)
+        timestep = environment.step(action)
+        physics.set_control(action)
+        physics.step(ours.task.physics_steps_per_control_step)
+        assert ours.task.get_reward(physics) == pytest.approx(timestep.reward, abs=1e-12)
+
+
+def test_reward_is_that_of_dm_control_at_every_distance(ours, theirs):
+    physics, (environment, _) = ours.start(3), theirs(3)
+    reference = environment.physics
+    draw = np.random.RandomState(0)
+    distances = draw.uniform(0.0, 0.15, 300)
+    assert np.histogram(distances, bins=5, range=(0, 0.15))[0].min() > 30
+    for distance in distances:
+        direction = draw.normal(size=3)
+        offset = distance * direction / np.linalg.norm(direction)
+        for simulation in (physics, reference):  # the brick's free joint comes last
+            simulation.data.qpos[-7:-4] = ours.task.tool_center_point(physics) + offset
+            simulation.forward()
+        reward = ours.task.get_reward(physics)
+        assert reward == pytest.approx(environment.task.get_reward(reference), abs=1e-9)
+        assert 0.0 <= reward <= 1.0
+        assert ours.task.distance(physics) == pytest.approx(distance, abs=1e-9)
+        assert ours.task.success(physics) == (ours.task.distance(physics) <= 0.05)
+
+
+def check_starts(ours, seeds):
+    """Each start lies within its box, at rest, and the hand touches nothing."""
+    task = ours.task
+    yaws, closures = [], []
+    for seed in seeds:
+        physics = ours.start(seed)
+        hand, brick = task.tool_center_point(physics), task.prop_position(physics)
+        assert (hand >= np.array(jaco.HAND_SPAWN.lower) - 0.002).all()
+        assert (hand <= np.array(jaco.HAND_SPAWN.upper) + 0.002).all()
+        assert (np.abs(brick[:2]) <= 0.101).all()
+        assert abs(brick[2]) < 1e-3
+        down = physics.bind(task.hand.tool_center_point).xmat.reshape(3, 3)[:, 2]
+        assert down[2] == pytest.approx(-1.0, abs=0.01)
+        of_hand = set(physics.bind(task.hand.mjcf_model.find_all("geom")).element_id)
+        of_brick = set(physics.bind(task.prop.mjcf_model.find_all("geom")).element_id)
+        for contact in physics.data.contact:
+            touching = {contact.geom1, contact.geom2}
+            assert not (touching & of_hand and touching & of_brick)
+        w, _, _, z = physics.data.qpos[-4:]
+        yaws.append(2 * np.arctan2(z, w) % (2 * np.pi))
+        low, high = physics.bind(task.hand.joints).range.T
+        closures.append(((physics.bind(task.hand.joints).qpos - low) / (high - low)).mean())
+    return np.array(yaws), np.array(closures)
+
+
+def test_starts_lie_within_their_boxes(ours):
+    check_starts(ours, range(30))
+
+
+@pytest.mark.long
+def test_yaw_and_fingers_start_anywhere(ours):
+    yaws, closures = check_starts(ours, range(500))
+    for share in (yaws / (2 * np.pi), closures):
+        counts = np.histogram(share, bins=5, range=(0, 1))[0]
+        assert counts.min() > 60  # 100 in each of the five is expected
+
+
+def test_every_task_by_its_name():
+    assert TASKS["reach_duplo"] is ReachDuplo
+
+
+def test_a_wrong_version_is_met_with_one_sentence(monkeypatch):
+    monkeypatch.setattr(simulator, "version", lambda _: "4.0.0")
+    with pytest.raises(MerlError, match=r"merl needs mujoco 3\.17\.0, found 4\.0\.0: pip install"):
+        simulator.check_versions()

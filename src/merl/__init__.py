@@ -12,6 +12,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 __all__ = ["__version__", "load_policy", "make_env"]
 
+from merl.envs.registration import register as _register
+
+_register()
+
 if TYPE_CHECKING:
     from merl.envs import make_env
     from merl.training.evaluation import load_policy

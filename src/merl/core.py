@@ -85,13 +85,12 @@ class Batch:
         """The same batch on `device`; itself if it is there already."""
         if self.action.device == device:
             return self
-        move = {"device": device, "non_blocking": True}
         return Batch(
-            observation={k: v.to(**move) for k, v in self.observation.items()},
-            action=self.action.to(**move),
-            reward=self.reward.to(**move),
-            discount=self.discount.to(**move),
-            next_observation={k: v.to(**move) for k, v in self.next_observation.items()},
+            {key: value.to(device) for key, value in self.observation.items()},
+            self.action.to(device),
+            self.reward.to(device),
+            self.discount.to(device),
+            {key: value.to(device) for key, value in self.next_observation.items()},
         )
 
 
@@ -99,7 +98,7 @@ class Agent(Protocol):
     """What the training loop asks of a learner."""
 
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
-        """Actions (B, A) in [-1, 1] for stacked observations; with the noise of exploration or without."""
+        """Actions (B, A) in [-1, 1] for stacked observations, with exploration noise or without."""
         ...
 
     def update(self, batch: Batch) -> dict[str, Tensor]:

@@ -38,10 +38,10 @@ class DDPGConfig:
     noise_clip: float = 0.3
     """Bound of the noise in both updates; when acting it is not clipped."""
     target: Literal["heads", "heads_and_fusion"] = "heads"
-    """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too (as DrQ-v2's trunk)."""
+    """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too (DrQ-v2's)."""
     precision: Precision = "auto"
-    """Arithmetic of the update: fp32, bf16 (autocast; weights, norms, targets and losses stay fp32),
-    or auto, which times both once."""
+    """Arithmetic of the update: fp32, bf16 (weights, norms, targets and losses stay fp32), or auto,
+    which times both once."""
 
     def __post_init__(self) -> None:
         if not self.learning_rate > 0:
@@ -174,7 +174,7 @@ class DDPG:
         batch: Batch,
         next_noise: Tensor,
     ) -> dict[str, Tensor]:
-        """Eq. 1: both Q-functions towards y; the encoders and the critic's fusion learn with them."""
+        """Eq. 1: both Q-functions towards y; encoders and the critic's fusion learn with them."""
         networks = self.networks
         with self._arithmetic():
             with torch.no_grad():
@@ -212,8 +212,8 @@ class DDPG:
     @torch.no_grad()
     def update_target(self) -> None:
         """phi_bar <- (1 - tau) phi_bar + tau phi."""
-        average = list(self.critic_target.parameters())
-        recent = [p for part in self._averaged().values() for p in part.parameters()]
+        average: list[Tensor] = list(self.critic_target.parameters())
+        recent: list[Tensor] = [p for part in self._averaged().values() for p in part.parameters()]
         torch._foreach_lerp_(average, recent, self.config.tau)
 
     def draw(self, batch: Batch) -> Draws:
@@ -280,9 +280,9 @@ class DDPG:
 
 
 def _step(optimizer: torch.optim.Optimizer, loss: Tensor, parameters: list[nn.Parameter]) -> None:
-    """One step of gradient descent on these parameters; the gradients of all others stay as they are."""
+    """One step of gradient descent on these parameters; other gradients stay as they are."""
     optimizer.zero_grad()
-    loss.backward(inputs=parameters)
+    torch.autograd.backward(loss, inputs=parameters)
     optimizer.step()
 
 

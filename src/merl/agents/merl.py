@@ -16,6 +16,7 @@ Where the paper is silent or contradicts itself, `docs/paper.md` says what was c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from gymnasium import spaces
@@ -24,7 +25,7 @@ from merl.agents.ddpg import DDPG, DDPGConfig, Networks
 from merl.core import MerlError, is_image, is_vector
 from merl.networks.encoders import ConvEncoder, IdentityEncoder, MLPEncoder
 from merl.networks.fusion import Fusion, Squash
-from merl.networks.heads import Actor, TwinCritic
+from merl.networks.heads import Actor, HeadSize, TwinCritic
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
 
@@ -68,16 +69,16 @@ class MERLConfig(DDPGConfig):
             raise MerlError(f"agent.shift-pad must be at least 0, not {self.shift_pad}")
 
 
-def modalities(
-    config: MERLConfig, space: spaces.Dict
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def modalities(config: MERLConfig, space: spaces.Dict) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The image keys and the vector keys that the agent consumes, checked against the space."""
     images = _keys("images", config.images, [k for k, s in space.items() if is_image(s)])
     given = [k for k, s in space.items() if is_vector(s)]
     vectors = _keys("vectors", config.vectors, given, default=[k for k in given if k != "state"])
     if not images and not vectors:
-        raise MerlError(f"MERL finds nothing to sense among {sorted(space)}: an image is a uint8 "
-                        "box (H, W, C), a vector a float box (n,)")
+        raise MerlError(
+            f"MERL finds nothing to sense among {sorted(space)}: an image is a uint8 "
+            "box (H, W, C), a vector a float box (n,)"
+        )
     return images, vectors
 
 
@@ -85,24 +86,17 @@ def make_networks(config: MERLConfig, space: spaces.Dict, action_dim: int, stack
     """Build and initialise MERL's networks for stacks of `stack` frames (torch's global seed)."""
     images, vectors = modalities(config, space)
     encoders = Encoders(
-        {key: _image_encoder(config, space[key].shape, stack) for key in images},
-        {key: _vector_encoder(config, space[key].shape) for key in vectors},
+        {key: _image_encoder(config, space[key], stack) for key in images},
+        {key: _vector_encoder(config, space[key]) for key in vectors},
         pad=config.shift_pad,
     )
     critic_fusion, actor_fusion = (
         Fusion(encoders.features, config.latent_dim, config.fusion_norm, config.squash)
         for _ in range(2)
     )
-    critic, actor = (
-        head(
-            config.latent_dim,
-            action_dim,
-            layers=config.head_layers,
-            width=config.hidden_dim,
-            layer_norm=config.head_norm,
-        )
-        for head in (TwinCritic, Actor)
-    )
+    size = HeadSize(config.head_layers, config.hidden_dim, config.head_norm)
+    critic = TwinCritic(config.latent_dim, action_dim, size)
+    actor = Actor(config.latent_dim, action_dim, size)
     networks = Networks(encoders, critic_fusion, critic, actor_fusion, actor)
     orthogonal(networks)
     return networks
@@ -123,15 +117,17 @@ def make_merl(
     return DDPG(networks, config, seed=seed, device=device)
 
 
-def _image_encoder(config: MERLConfig, shape: tuple[int, ...], stack: int) -> ConvEncoder:
-    height, width, channels = shape
+def _image_encoder(config: MERLConfig, space: spaces.Space[Any], stack: int) -> ConvEncoder:
+    assert space.shape is not None
+    height, width, channels = space.shape
     return ConvEncoder(stack * channels, (height, width), config.conv_channels, config.conv_strides)
 
 
-def _vector_encoder(config: MERLConfig, shape: tuple[int, ...]) -> IdentityEncoder | MLPEncoder:
+def _vector_encoder(config: MERLConfig, space: spaces.Space[Any]) -> IdentityEncoder | MLPEncoder:
+    assert space.shape is not None
     if config.vector_encoder_dim:
-        return MLPEncoder(shape[0], config.vector_encoder_dim)
-    return IdentityEncoder(shape[0])
+        return MLPEncoder(space.shape[0], config.vector_encoder_dim)
+    return IdentityEncoder(space.shape[0])
 
 
 def _keys(

@@ -1,0 +1,15 @@
+"""What is timed, and against what."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rich.console import RenderableType
+
+from merl.bench import env
+
+BENCHES: dict[str, tuple[Callable[..., dict[str, Any]], Callable[[Any], RenderableType]]] = {
+    "env": (env.run, env.table),
+}
+"""Name to the measurement and to how its result is shown."""

@@ -1,0 +1,1 @@
+"""What is run: presets, and later the paper's figures as data."""

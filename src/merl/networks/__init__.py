@@ -1,1 +1,1 @@
-"""The pieces that a representation and its heads are built from; no piece knows a robot or a learner."""
+"""The pieces of a representation and its heads; no piece knows a robot or a learner."""

@@ -67,9 +67,7 @@ def to_input(images: Tensor, dtype: torch.dtype) -> Tensor:
     The memory is in channels-last order, which is what convolutions are fastest with.
     """
     batch, stack, height, width, channels = images.shape
-    pixels = torch.empty(
-        (batch, height, width, stack, channels), dtype=dtype, device=images.device
-    )
+    pixels = torch.empty((batch, height, width, stack, channels), dtype=dtype, device=images.device)
     # A copy per channel runs along whole images; one permuted copy would run along three bytes.
     for frame in range(stack):
         for channel in range(channels):

@@ -46,7 +46,7 @@ class ConvEncoder(nn.Module):
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images (B, C, H, W) in [-0.5, 0.5] to features (B, F), in the order rows, columns, channels."""
+        """Images (B, C, H, W) in [-0.5, 0.5] to features (B, F): rows, columns, channels."""
         maps: Tensor = self.convolutions(images)  # (B, 32, h, w)
         return maps.permute(0, 2, 3, 1).flatten(1)  # a view: the memory is channels-last
 

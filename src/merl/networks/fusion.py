@@ -60,5 +60,5 @@ class Fusion(nn.Module):
     def _squash(self, latent: Tensor) -> Tensor:
         if self.squash == "tanh":
             return torch.tanh(latent)
-        groups = latent.unflatten(-1, (-1, SIMPLEX_GROUP))
+        groups = latent.reshape(len(latent), -1, SIMPLEX_GROUP)
         return torch.softmax(groups, dim=-1).flatten(-2)

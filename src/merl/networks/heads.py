@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 
@@ -18,23 +21,34 @@ class _Hidden(nn.Module):
         return torch.relu(self.norm(self.linear(x).to(self.linear.weight.dtype)))
 
 
-def mlp(
-    in_features: int, out_features: int, *, layers: int, width: int, layer_norm: bool
-) -> nn.Sequential:
-    """`layers` linear layers, the output layer counted; LayerNorm and ReLU after each but the last."""
-    widths = [in_features] + [width] * (layers - 1)
-    hidden = [_Hidden(a, b, layer_norm) for a, b in zip(widths, widths[1:], strict=False)]
+@dataclass(frozen=True)
+class HeadSize:
+    """The shape of actor and critic.
+
+    Attributes:
+        layers: linear layers, the output layer counted.
+        width: of each hidden layer.
+        layer_norm: LayerNorm before each ReLU.
+    """
+
+    layers: int
+    width: int
+    layer_norm: bool = True
+
+
+def mlp(in_features: int, out_features: int, size: HeadSize) -> nn.Sequential:
+    """An MLP of that shape; ReLU after each layer but the last."""
+    widths = [in_features] + [size.width] * (size.layers - 1)
+    hidden = [_Hidden(a, b, size.layer_norm) for a, b in pairwise(widths)]
     return nn.Sequential(*hidden, nn.Linear(widths[-1], out_features))
 
 
 class Actor(nn.Module):
     """pi_theta: the latent to the mean action."""
 
-    def __init__(
-        self, latent_dim: int, action_dim: int, *, layers: int, width: int, layer_norm: bool
-    ) -> None:
+    def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
         super().__init__()
-        self.layers = mlp(latent_dim, action_dim, layers=layers, width=width, layer_norm=layer_norm)
+        self.layers = mlp(latent_dim, action_dim, size)
 
     def forward(self, latent: Tensor) -> Tensor:
         """(B, d) to (B, A), in (-1, 1)."""
@@ -45,14 +59,9 @@ class Actor(nn.Module):
 class TwinCritic(nn.Module):
     """Q_phi1 and Q_phi2, two heads of their own over one latent (clipped double Q, TD3)."""
 
-    def __init__(
-        self, latent_dim: int, action_dim: int, *, layers: int, width: int, layer_norm: bool
-    ) -> None:
+    def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
         super().__init__()
-        self.q1, self.q2 = (
-            mlp(latent_dim + action_dim, 1, layers=layers, width=width, layer_norm=layer_norm)
-            for _ in range(2)
-        )
+        self.q1, self.q2 = (mlp(latent_dim + action_dim, 1, size) for _ in range(2))
 
     def forward(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Latent (B, d) and action (B, A) to the two values, (B,) each."""

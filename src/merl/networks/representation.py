@@ -1,4 +1,4 @@
-"""What an agent sees: one encoder per sense, shared; one fusion for the actor, one for the critic."""
+"""What an agent senses: an encoder per modality, shared by actor and critic."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.report.statistics import bootstrap_interval
+from merl.statistics import bootstrap_interval
 
 METRICS_FILE = "metrics.csv"
 

@@ -22,8 +22,8 @@ class EvaluationConfig:
     """Steps between evaluations."""
     episodes: int = 10
     """Episodes of each evaluation."""
-    video: bool = True
-    """Whether to film the first episode of each evaluation."""
+    video: Literal["each", "last", "none"] = "each"
+    """Which evaluations to film (their first episode)."""
 
     def __post_init__(self) -> None:
         for name in ("every", "episodes"):

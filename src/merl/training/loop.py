@@ -24,11 +24,12 @@ from merl.training.rollout import Episode, FrameStack
 
 @dataclass
 class Progress:
-    """Where a run stands; together with agent, replay and random states, all that it goes on from."""
+    """Where a run stands."""
 
     step: int = 0
     updates: int = 0
     episodes: int = 0
+    evaluated: int = 0  # the step of the last evaluation
 
 
 @dataclass(frozen=True)

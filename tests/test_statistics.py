@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from merl.report.statistics import Interval, bootstrap_interval, wilson_interval
+from merl.statistics import Interval, bootstrap_interval, wilson_interval
 
 
 def test_bootstrap_of_two_values_by_hand():

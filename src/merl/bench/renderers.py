@@ -1,0 +1,39 @@
+"""Which renderers work here, and how fast they draw."""
+
+from __future__ import annotations
+
+import time
+from typing import get_args
+
+from merl.core import MerlError
+from merl.envs import make_env
+from merl.envs.config import RendererName
+
+FRAMES = 20
+
+
+def renderer_speeds(task: str = "reach_duplo", size: int = 84) -> dict[str, float | str]:
+    """Frames per second of each renderer, or one line on why it does not work."""
+    return {name: _speed(task, size, name) for name in get_args(RendererName)}
+
+
+def _speed(task: str, size: int, name: RendererName) -> float | str:
+    try:
+        env = make_env(
+            task,
+            renderer=name,
+            observations=("proprio",),
+            render_size=size,
+            render_mode="rgb_array",
+        )
+        try:
+            env.reset(seed=0)
+            env.render()  # the first picture builds what the others use
+            start = time.perf_counter()
+            for _ in range(FRAMES):
+                env.render()
+            return FRAMES / (time.perf_counter() - start)
+        finally:
+            env.close()
+    except MerlError as error:
+        return str(error)

@@ -1,0 +1,51 @@
+"""The command line.
+
+Exit codes: 0 done; 2 bad input, told in one line; 130 and 143 stopped by Ctrl-C or SIGTERM, saved
+and ready to go on.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+import merl
+from merl.cli.parsing import meant
+from merl.core import MerlError
+
+# The modules are imported when called: a misspelt command should not wait for torch.
+COMMANDS = {
+    "train": ("merl.cli.train", "train", "train an agent"),
+    "resume": ("merl.cli.train", "resume", "go on with a run"),
+    "evaluate": ("merl.cli.evaluate", "evaluate", "run a trained policy, film it"),
+    "info": ("merl.cli.info", "info", "what this machine offers"),
+    "bench": ("merl.cli.bench", "bench", "time merl against what there was before"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code."""
+    args = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        if not args or args[0] in ("-h", "--help"):
+            print(_usage())
+            return 0
+        if args[0] == "--version":
+            print(f"merl {merl.__version__}")
+            return 0
+        if args[0] not in COMMANDS:
+            raise MerlError(f"command {args[0]!r} is unknown: {meant(args[0], COMMANDS)}")
+        module, name, _ = COMMANDS[args[0]]
+        code: int = getattr(import_module(module), name)(args[1:])
+        return code
+    except MerlError as error:
+        print(f"merl: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _usage() -> str:
+    lines = [f"  {name:<10}{about}" for name, (_, _, about) in COMMANDS.items()]
+    return "\n".join(["usage: merl COMMAND ...", "", *lines, "", "merl COMMAND --help tells more."])

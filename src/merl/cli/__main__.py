@@ -1,0 +1,7 @@
+"""python -m merl.cli."""
+
+import sys
+
+from merl.cli import main
+
+sys.exit(main())

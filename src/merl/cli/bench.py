@@ -1,0 +1,39 @@
+"""merl bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from merl.bench import BENCHES
+from merl.cli.parsing import meant, parse, write_json
+from merl.core import MerlError
+
+
+def bench(args: list[str]) -> int:
+    """Time what merl does against what there was before: merl bench env."""
+    if not args or args[0] in ("-h", "--help"):
+        print(f"usage: merl bench {{{','.join(BENCHES)}}} [--repeats N] [--json FILE]")
+        return 0
+    if args[0] not in BENCHES:
+        raise MerlError(f"bench {args[0]!r} is unknown: {meant(args[0], BENCHES)}")
+
+    def command(repeats: int = 5, json: Path | None = None) -> tuple[int, Path | None]:
+        """Interleaved repeats on the same work, medians and their spread.
+
+        Args:
+            repeats: How often each side is measured.
+            json: Also write the figures into this file.
+        """
+        return repeats, json
+
+    repeats, output = parse(command, f"merl bench {args[0]}", args[1:])
+    if repeats < 1:
+        raise MerlError(f"--repeats must be at least 1, not {repeats}")
+    run, show = BENCHES[args[0]]
+    result = run(repeats=repeats)
+    Console().print(show(result))
+    if output is not None:
+        write_json(output, result)
+    return 0

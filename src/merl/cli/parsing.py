@@ -1,0 +1,72 @@
+"""Reading the command line: tyro's parser, with its errors in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tyro
+
+from merl.core import MerlError
+
+T = TypeVar("T")
+
+
+def parse(target: Callable[..., T], prog: str, args: list[str], **options: Any) -> T:
+    """Tyro's parser, with its errors in one line."""
+    errors = io.StringIO()
+    columns = os.environ.get("COLUMNS")
+    asks_help = any(arg in ("-h", "--help") for arg in args)
+    try:
+        if not asks_help:
+            os.environ["COLUMNS"] = "1000"  # or the message would be broken into lines
+        with contextlib.redirect_stderr(errors):
+            parsed: T = tyro.cli(target, prog=prog, args=args, **options)
+            return parsed
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise MerlError(_one_line(errors.getvalue())) from None
+    finally:
+        if columns is None:
+            os.environ.pop("COLUMNS", None)
+        else:
+            os.environ["COLUMNS"] = columns
+
+
+def _one_line(box: str) -> str:
+    """The message of tyro's framed error, and the first flag that it thinks was meant."""
+    lines = [line.strip("│╭╰╮╯─ ") for line in box.splitlines()]
+    parts = [line for line in lines[1:] if line]
+    message = parts[0] if parts else box.strip()
+    message = message[0].lower() + message[1:]
+    if "erhaps you meant" in box:
+        flag = next((re.match(r"--[\w.-]+", line) for line in parts if line.startswith("--")), None)
+        if flag:
+            message += f": did you mean {flag.group()}?"
+    return message
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """What a misspelt name was perhaps meant to be, or all that there is."""
+    close = get_close_matches(name, list(known), n=1)
+    return f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a file that the user asked for.
+
+    Raises:
+        MerlError: it cannot be written.
+    """
+    try:
+        path.write_text(json.dumps(value, indent=1) + "\n")
+    except OSError as error:
+        raise MerlError(f"{path} cannot be written: {error.strerror}") from None

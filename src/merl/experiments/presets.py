@@ -1,0 +1,49 @@
+"""Presets: a name for a whole set of values. They only compose; every value can be overridden."""
+
+from __future__ import annotations
+
+import tyro
+
+from merl.agents.merl import MERLConfig
+from merl.envs.config import EnvConfig
+from merl.replay import ReplayConfig
+from merl.training.config import EvaluationConfig, TrainConfig
+
+_TASK: str = tyro.MISSING  # the command line asks for it
+
+PRESETS: dict[str, TrainConfig] = {
+    # Table 1 of the paper, on pictures as OpenGL draws them.
+    "paper": TrainConfig(_TASK, preset="paper"),
+    # Made for two cores without a GPU: what learns most per minute (docs/laptop.md).
+    "laptop": TrainConfig(
+        _TASK,
+        preset="laptop",
+        steps=200_000,
+        random_steps=1000,
+        seed_steps=2000,
+        updates_per_step=0.5,
+        env=EnvConfig(renderer="warp", image_size=48),
+        replay=ReplayConfig(batch_size=128),
+        agent=MERLConfig(conv_strides=(2, 2, 1, 1), shift_pad=2, hidden_dim=512),
+        eval=EvaluationConfig(every=10_000, episodes=10, video="last"),
+    ),
+    # The whole pipeline in under a minute; too short to learn anything.
+    "smoke": TrainConfig(
+        _TASK,
+        preset="smoke",
+        steps=1000,
+        random_steps=250,
+        seed_steps=250,
+        updates_per_step=0.1,
+        env=EnvConfig(renderer="warp", image_size=32),
+        replay=ReplayConfig(batch_size=32),
+        agent=MERLConfig(conv_strides=(2, 2, 1, 1), shift_pad=2, hidden_dim=128),
+        eval=EvaluationConfig(every=500, episodes=2, video="last"),
+    ),
+}
+
+ABOUT = {
+    "paper": "Table 1, OpenGL pictures: for a machine with CUDA",
+    "laptop": "made for 2 cores without a GPU: learns in about an hour",
+    "smoke": "the whole pipeline in under a minute: shows that it works, learns nothing",
+}

@@ -1,0 +1,223 @@
+"""Checkpoints: folders that are whole or not there at all.
+
+`checkpoints/00010000/` holds `weights.safetensors` (networks and target), `learner.pt` (optimizers
+and random generators; read with `weights_only=True`), `state.json` (where the run stood) and
+`manifest.json` (sizes and SHA-256 of the others). It is written under a temporary name, flushed to
+the disk, then renamed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import pickle
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from merl.core import Agent, MerlError
+
+FORMAT = 1
+_WEIGHTS, _LEARNER, _STATE, _MANIFEST = (
+    "weights.safetensors",
+    "learner.pt",
+    "state.json",
+    "manifest.json",
+)
+_WEIGHT_GROUPS = ("networks", "critic_target")
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint on the disk, checked against its manifest.
+
+    Attributes:
+        path: its folder.
+        step: environment steps at which it was taken.
+        score: the evaluation return at that step, if there was one.
+    """
+
+    path: Path
+    step: int
+    score: float | None
+
+    @classmethod
+    def open(cls, path: Path) -> Checkpoint:
+        """Read the manifest and check every file against it.
+
+        Raises:
+            MerlError: a file is missing, cut short or changed.
+        """
+        try:
+            manifest = json.loads((path / _MANIFEST).read_text())
+            files, number = manifest["files"], manifest["format"]
+            step, score = int(manifest["step"]), manifest["score"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise MerlError(f"checkpoint {path} has no readable manifest ({error})") from None
+        if number != FORMAT:
+            raise MerlError(f"checkpoint {path} has format {number}, this merl reads {FORMAT}")
+        for name, expected in files.items():
+            if not (path / name).is_file() or _fingerprint(path / name) != expected:
+                raise MerlError(f"checkpoint {path}: {name} is missing or damaged")
+        return cls(path, step, None if score is None else float(score))
+
+    @classmethod
+    def find(cls, root: Path, which: str = "latest") -> Checkpoint:
+        """The "latest" whole checkpoint, the "best", or the one of a number of steps.
+
+        Raises:
+            MerlError: there is none.
+        """
+        if which not in ("latest", "best"):
+            if not which.isdigit() or not (root / f"{int(which):08d}").is_dir():
+                steps = ", ".join(str(int(path.name)) for path in _folders(root))
+                raise MerlError(f"checkpoint {which!r} is not there: latest, best, or {steps}")
+            return cls.open(root / f"{int(which):08d}")
+        whole = []
+        for path in reversed(_folders(root)):
+            try:
+                whole.append(cls.open(path))
+            except MerlError as error:
+                _LOG.warning("%s: passed over", error)
+                continue
+            if which == "latest":
+                return whole[0]
+        scored = [checkpoint for checkpoint in whole if checkpoint.score is not None]
+        if not whole:
+            raise MerlError(f"no whole checkpoint in {root}: the run ended before its first one")
+        return max(scored, key=lambda c: c.score or 0.0) if scored else whole[0]
+
+    def state(self) -> dict[str, Any]:
+        """Where the run stood: what `save` was given."""
+        state: dict[str, Any] = json.loads((self.path / _STATE).read_text())
+        return state
+
+
+def save(
+    root: Path,
+    step: int,
+    agent: Agent,
+    state: Mapping[str, Any],
+    *,
+    score: float | None,
+    keep: int,
+) -> Checkpoint:
+    """Write a checkpoint, then let go of old ones but the last `keep` and the best.
+
+    Args:
+        root: the run's folder of checkpoints.
+        step: environment steps so far.
+        agent: whose state is saved.
+        state: plain types, to be kept beside the agent.
+        score: the evaluation return at this step, if there was an evaluation.
+        keep: how many of the last ones to keep.
+
+    Raises:
+        OSError: it could not be written; the former ones are untouched.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    part = root / f".part-{step:08d}"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    try:
+        _write(part, agent.state_dict(), state)
+        names = (_WEIGHTS, _LEARNER, _STATE)
+        manifest = {
+            "format": FORMAT,
+            "step": step,
+            "score": score,
+            "files": {name: _fingerprint(part / name) for name in names},
+        }
+        (part / _MANIFEST).write_text(json.dumps(manifest, indent=1))
+        for path in (*part.iterdir(), part):
+            _sync(path)
+        final = root / f"{step:08d}"
+        shutil.rmtree(final, ignore_errors=True)
+        part.rename(final)
+        _sync(root)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    _prune(root, keep)
+    return Checkpoint(final, step, score)
+
+
+def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
+    """Give an agent the weights, optimizers and generators of a checkpoint.
+
+    Raises:
+        MerlError: a file cannot be read, or belongs to other networks.
+    """
+    try:
+        weights = load_file(checkpoint.path / _WEIGHTS)
+        learner = torch.load(checkpoint.path / _LEARNER, map_location="cpu", weights_only=True)
+        groups = {
+            group: {
+                name.removeprefix(f"{group}."): tensor
+                for name, tensor in weights.items()
+                if name.startswith(f"{group}.")
+            }
+            for group in _WEIGHT_GROUPS
+        }
+        agent.load_state_dict({**groups, **learner})
+    except (OSError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        first = str(error).strip().split("\n")[0]
+        raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {first}") from None
+
+
+def _write(folder: Path, agent: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+    weights = {
+        f"{group}.{name}": tensor.detach().cpu().contiguous()
+        for group in _WEIGHT_GROUPS
+        for name, tensor in agent[group].items()
+    }
+    save_file(weights, folder / _WEIGHTS)
+    torch.save({k: v for k, v in agent.items() if k not in _WEIGHT_GROUPS}, folder / _LEARNER)
+    (folder / _STATE).write_text(json.dumps(state))
+
+
+def _folders(root: Path) -> list[Path]:
+    """Checkpoints by step, oldest first."""
+    if not root.is_dir():
+        return []
+    return sorted(path for path in root.iterdir() if path.is_dir() and path.name.isdigit())
+
+
+def _prune(root: Path, keep: int) -> None:
+    folders = _folders(root)
+    scores = {path: score for path, score in _scores(folders) if score is not None}
+    best = max(scores, key=lambda path: scores[path]) if scores else None
+    for path in folders[:-keep]:
+        if path != best:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _scores(folders: list[Path]) -> Iterator[tuple[Path, float | None]]:
+    for path in folders:
+        try:
+            yield path, json.loads((path / _MANIFEST).read_text())["score"]
+        except (OSError, ValueError, KeyError):
+            yield path, None
+
+
+def _fingerprint(path: Path) -> dict[str, Any]:
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {"bytes": path.stat().st_size, "sha256": digest}
+
+
+def _sync(path: Path) -> None:
+    """Have a file, or a folder's list of names, reach the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

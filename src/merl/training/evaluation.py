@@ -1,0 +1,250 @@
+"""What an agent has learnt: it acts without noise, from starts that are the same every time."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from merl.agents.merl import make_merl
+from merl.core import Agent, MerlError, Observation, is_image
+from merl.envs import make_env
+from merl.statistics import Interval, bootstrap_interval, wilson_interval
+from merl.training.checkpoint import Checkpoint, load_agent
+from merl.training.config import TrainConfig
+from merl.training.rollout import Episode, FrameStack
+from merl.training.run import Run
+from merl.training.video import VideoWriter
+
+EVALUATION_SEED = 1_000_000
+"""Episode i of every evaluation starts from `env.reset(seed=EVALUATION_SEED + i)`."""
+
+Act = Callable[[Observation], NDArray[np.float32]]
+
+
+class Policy:
+    """A trained agent, ready to act on single observations; it stacks the frames itself.
+
+    Call `reset()` at the start of every episode, then the policy with each observation in turn.
+
+    Attributes:
+        config: of the run that it comes from.
+        step: environment steps after which it was saved.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        config: TrainConfig,
+        space: spaces.Dict,
+        device: torch.device,
+        step: int = 0,
+    ) -> None:
+        self.config, self.step = config, step
+        self._agent = agent
+        self._space = space
+        images = tuple(key for key in space if is_image(space[key]))
+        self._stack = FrameStack(config.replay.frame_stack, images, device)
+        self._fresh = True
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self._fresh = True
+
+    def __call__(self, observation: Observation) -> NDArray[np.float32]:
+        """The action for an observation.
+
+        Args:
+            observation: as the environment gives it: images uint8 (H, W, C), vectors float (n,).
+
+        Returns:
+            float32 (A,), in [-1, 1].
+
+        Raises:
+            MerlError: a key is missing or has another shape than the agent was trained with.
+        """
+        sensed = {key: self._checked(key, observation) for key in self._space}
+        if self._fresh:
+            self._stack.reset(sensed)
+        else:
+            self._stack.push(sensed)
+        self._fresh = False
+        action = self._agent.act(self._stack.observation(), explore=False)[0]
+        result: NDArray[np.float32] = action.to("cpu", torch.float32).numpy()
+        return result
+
+    def make_env(self, **changes: Any) -> gymnasium.Env[Any, Any]:
+        """The environment that the agent was trained in, with fields of `EnvConfig` changed."""
+        renderer = changes.get("renderer", self.config.env.renderer)
+        if renderer != self.config.env.renderer:
+            warnings.warn(
+                f"the agent was trained with renderer {self.config.env.renderer!r} and sees "
+                f"{renderer!r} now: these pictures differ, and it may do worse",
+                stacklevel=2,
+            )
+        return make_run_env(self.config, **changes)
+
+    def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
+        space = self._space[key]
+        if key not in observation:
+            raise MerlError(
+                f"the observation lacks {key!r}: the agent consumes {list(self._space)}"
+            )
+        value = np.asarray(observation[key])
+        if value.shape != space.shape:
+            raise MerlError(f"observation {key!r} has shape {value.shape}: {space.shape} is needed")
+        return value.astype(space.dtype, copy=False)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What came out of some episodes.
+
+    Attributes:
+        episodes: one by one, in the order of their seeds.
+        returns: the mean return with its bootstrap interval.
+        success_end: the rate of success at the last step, with Wilson's interval; None where the
+            environment does not say.
+        success_any: likewise, at any step.
+    """
+
+    episodes: tuple[Episode, ...]
+    returns: Interval
+    success_end: Interval | None
+    success_any: Interval | None
+
+    def metrics(self) -> dict[str, float]:
+        """By name, as they stand in `metrics.csv` (behind `eval/`)."""
+        values = {"episodes": float(len(self.episodes))}
+        named = {
+            "return": self.returns,
+            "success_end": self.success_end,
+            "success_any": self.success_any,
+        }
+        for name, interval in named.items():
+            if interval is not None:
+                values |= {
+                    name: interval.mean,
+                    f"{name}_low": interval.low,
+                    f"{name}_high": interval.high,
+                }
+        for name in self.episodes[0].terms:
+            values[f"reward/{name}"] = float(np.mean([e.terms[name] for e in self.episodes]))
+        return values
+
+
+def evaluate(
+    act: Act,
+    env: gymnasium.Env[Any, Any],
+    episodes: int,
+    *,
+    reset: Callable[[], None] = lambda: None,
+    video: Path | None = None,
+    tick: Callable[[int], None] = lambda episode: None,
+) -> Evaluation:
+    """Run episodes from the evaluation's starts.
+
+    Args:
+        act: observation to action.
+        env: with `render_mode="rgb_array"` if there is to be a video.
+        episodes: how many.
+        reset: called before each episode.
+        video: where to film the first episode.
+        tick: called after every step, with the number of the episode; may raise to end it.
+    """
+    results = []
+    for index in range(episodes):
+        reset()
+        film = video if index == 0 else None
+        results.append(_run_episode(act, env, index, film, tick))
+    return summarize(results)
+
+
+def summarize(episodes: list[Episode]) -> Evaluation:
+    """Means and intervals over episodes."""
+    ends = [e.success for e in episodes if e.success is not None]
+    anys = [e.success_any for e in episodes if e.success_any is not None]
+    return Evaluation(
+        tuple(episodes),
+        bootstrap_interval([e.total_reward for e in episodes]),
+        wilson_interval(sum(ends), len(ends)) if ends else None,
+        wilson_interval(sum(anys), len(anys)) if anys else None,
+    )
+
+
+def _run_episode(
+    act: Act,
+    env: gymnasium.Env[Any, Any],
+    index: int,
+    video: Path | None,
+    tick: Callable[[int], None],
+) -> Episode:
+    episode, over = Episode(), False
+    observation, _ = env.reset(seed=EVALUATION_SEED + index)
+    with ExitStack() as stack:
+        film = None
+        if video is not None:
+            fps = env.metadata.get("render_fps", 25)
+            film = stack.enter_context(VideoWriter(video, fps=fps))
+        while not over:
+            observation, reward, terminated, truncated, info = env.step(act(observation))
+            episode.add(float(reward), info)
+            over = terminated or truncated
+            if film is not None:
+                film.add(np.asarray(env.render()), _caption(episode))
+            tick(index)
+    return episode
+
+
+def _caption(episode: Episode) -> dict[str, str | float | bool | int]:
+    caption: dict[str, str | float | bool | int] = {
+        "step": episode.length,
+        "return": episode.total_reward,
+    }
+    if episode.success is not None:
+        caption["success"] = episode.success
+    return caption
+
+
+def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
+    """The environment of a run, with fields of its `EnvConfig` (or `render_mode`) changed."""
+    render_mode = changes.pop("render_mode", None)
+    settings = {name: getattr(config.env, name) for name in type(config.env).__dataclass_fields__}
+    return make_env(config.task, render_mode=render_mode, **settings | changes)
+
+
+def load_policy(run: str | Path, *, checkpoint: str = "latest") -> Policy:
+    """The policy that a run has learnt.
+
+    Args:
+        run: the run's folder.
+        checkpoint: "latest", "best" (by evaluation return), or a checkpoint's number of steps.
+
+    Raises:
+        MerlError: there is no run, or no whole checkpoint in it.
+    """
+    opened = Run.open(Path(run))
+    saved = Checkpoint.find(opened.checkpoints, checkpoint)
+    config, device = opened.config, torch.device("cpu")
+    if config.device == "cuda" and torch.cuda.is_available():
+        device = torch.device("cuda")
+    observation_space, action_space = opened.spaces()
+    agent = make_merl(
+        config.agent,
+        observation_space,
+        action_space,
+        frame_stack=config.replay.frame_stack,
+        seed=0,
+        device=device,
+    )
+    load_agent(agent, saved)
+    return Policy(agent, config, observation_space, device, step=saved.step)

@@ -1,0 +1,219 @@
+"""A run is a folder; everything after training works from that folder alone.
+
+config.json     what was run: the config, the spaces, versions, commit, machine
+metrics.csv     the numbers, a row per episode and evaluation (the truth)
+tensorboard/    the same numbers as events
+checkpoints/    what the run goes on from
+replay/         the memory-mapped ring
+videos/         an evaluation episode each
+curve.png       the learning curve, drawn when training ends
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import subprocess
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+import merl
+from merl.core import MerlError
+from merl.training.config import TrainConfig
+
+CONFIG_FILE = "config.json"
+PACKAGES = ("torch", "numpy", "gymnasium", "dm_control", "mujoco", "mujoco-warp", "warp-lang")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run's folder and the config that it was started with."""
+
+    path: Path
+    config: TrainConfig
+
+    @classmethod
+    def create(
+        cls, config: TrainConfig, observation_space: spaces.Dict, action_space: spaces.Box
+    ) -> Run:
+        """Make the folder and record what is run.
+
+        Raises:
+            MerlError: the folder exists, or cannot be made.
+        """
+        path = run_path(config)
+        refuse_existing(path)
+        record = {
+            "format": 1,
+            "merl": merl.__version__,
+            "task": config.task,
+            "preset": config.preset,
+            "seed": config.seed,
+            "config": to_plain(config),
+            "observation_space": {key: _describe(s) for key, s in observation_space.items()},
+            "action_space": _describe(action_space),
+            "versions": package_versions(),
+            "commit": _commit(),
+            "machine": machine(),
+        }
+        try:
+            path.mkdir(parents=True)
+            (path / CONFIG_FILE).write_text(json.dumps(record, indent=1))
+        except OSError as error:
+            raise MerlError(f"the run's folder {path} cannot be made: {error.strerror}") from None
+        return cls(path, config)
+
+    @classmethod
+    def open(cls, path: Path) -> Run:
+        """A run that exists.
+
+        Raises:
+            MerlError: the folder is not a run's.
+        """
+        try:
+            record = json.loads((path / CONFIG_FILE).read_text())
+            config = from_plain(TrainConfig, record["config"])
+        except FileNotFoundError:
+            raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}") from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise MerlError(f"{path / CONFIG_FILE} cannot be read: {error}") from None
+        return cls(path, dataclasses.replace(config, run_dir=path))
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where the checkpoints are."""
+        return self.path / "checkpoints"
+
+    @property
+    def videos(self) -> Path:
+        """Where the videos are."""
+        return self.path / "videos"
+
+    @property
+    def replay(self) -> Path:
+        """Where the ring lies."""
+        return self.path / "replay"
+
+    def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
+        """What the agent consumes, and its actions, without building the environment."""
+        record = json.loads((self.path / CONFIG_FILE).read_text())
+        observation: dict[str, spaces.Space[Any]] = {
+            key: _box(d) for key, d in record["observation_space"].items()
+        }
+        return spaces.Dict(observation), _box(record["action_space"])
+
+
+def run_path(config: TrainConfig) -> Path:
+    """The folder that a config names, or the default one."""
+    return config.run_dir or Path("runs") / f"{config.task}-{config.preset}-s{config.seed}"
+
+
+def refuse_existing(path: Path) -> None:
+    """Never write into a folder that holds something.
+
+    Raises:
+        MerlError: the folder exists.
+    """
+    if path.exists():
+        raise MerlError(
+            f"run folder {path} exists already: go on with `merl resume {path}`, or name another "
+            "with --run-dir"
+        )
+
+
+def to_plain(config: Any) -> dict[str, Any]:
+    """A config as JSON knows it."""
+    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    return plain
+
+
+def from_plain(cls: type[T], plain: Mapping[str, Any]) -> T:
+    """The config that `to_plain` took apart; fields that are not there keep their defaults."""
+    hints = typing.get_type_hints(cls)
+    known = {name: _restore(hints[name], value) for name, value in plain.items() if name in hints}
+    return cls(**known)
+
+
+def _restore(hint: Any, value: Any) -> Any:
+    if isinstance(hint, types.UnionType):
+        hint = next(option for option in typing.get_args(hint) if option is not types.NoneType)
+    if value is None:
+        return None
+    if dataclasses.is_dataclass(hint):
+        return from_plain(typing.cast(type[Any], hint), value)
+    if hint is Path:
+        return Path(value)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def package_versions() -> dict[str, str]:
+    """The versions of what a result depends on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "missing"
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """What it runs on."""
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return {
+        "processor": processor_name(),
+        "cores": len(os.sched_getaffinity(0)),
+        "instructions": torch.backends.cpu.get_cpu_capability(),
+        "gpu": gpu,
+    }
+
+
+def processor_name() -> str:
+    """The processor's own name, where the system tells it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """The commit of the source, where it runs from a checkout."""
+    source = Path(merl.__file__).parent
+    command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None
+
+
+def _describe(space: spaces.Space[Any]) -> dict[str, Any]:
+    """Shape, type and bounds; JSON knows no infinity, so a box without bounds has none."""
+    assert isinstance(space, spaces.Box)
+    bounds = (float(space.low.min()), float(space.high.max()))
+    return {
+        "shape": list(space.shape),
+        "dtype": str(space.dtype),
+        "bounds": bounds if np.isfinite(bounds).all() else None,
+    }
+
+
+def _box(described: Mapping[str, Any]) -> spaces.Box:
+    dtype: Any = np.dtype(described["dtype"]).type
+    low, high = described["bounds"] or (-np.inf, np.inf)
+    return spaces.Box(low, high, tuple(described["shape"]), dtype)

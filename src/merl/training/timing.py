@@ -1,0 +1,123 @@
+"""What this machine needs for an update and for a step: measured once, before a run begins."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, Literal
+
+import gymnasium
+import torch
+from gymnasium import spaces
+
+from merl.agents.merl import MERLConfig, make_merl
+from merl.core import Batch, is_image
+from merl.training.config import TrainConfig
+
+REPEATS = 3
+MEASURED_STEPS = 25
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds, as measured.
+
+    Attributes:
+        update: of one update, for each precision that was tried.
+        step: of one environment step, picture included.
+        precision: the fastest, or the one that the config asks for.
+    """
+
+    update: Mapping[Literal["fp32", "bf16"], float]
+    step: float
+    precision: Literal["fp32", "bf16"]
+
+    def seconds(self, config: TrainConfig) -> float:
+        """The time that a run will take, evaluation included."""
+        updates = max(0, config.steps - config.seed_steps) * config.updates_per_step
+        evaluations = max(1, config.steps // config.eval.every) * config.eval.episodes
+        length = 250  # steps of an episode, near enough for an estimate
+        whole = updates * self.update[self.precision]
+        whole += (config.steps + evaluations * length) * self.step
+        return min(whole, (config.minutes or float("inf")) * 60)
+
+
+def measure(config: TrainConfig, env: gymnasium.Env[Any, Any], device: torch.device) -> Timing:
+    """Time the update in fp32 and bf16 (or as the config says), and the environment's step."""
+    asked = config.agent.precision
+    precisions: tuple[Literal["fp32", "bf16"], ...] = (
+        ("fp32", "bf16") if asked == "auto" else (asked,)
+    )
+    update = {p: _time_update(config, env, device, p) for p in precisions}
+    fastest = min(precisions, key=lambda p: update[p])
+    return Timing(update, _time_step(env), fastest)
+
+
+def _time_update(
+    config: TrainConfig, env: gymnasium.Env[Any, Any], device: torch.device, precision: Any
+) -> float:
+    space, actions = env.observation_space, env.action_space
+    assert isinstance(space, spaces.Dict)
+    assert isinstance(actions, spaces.Box)
+    agent_config: MERLConfig = dataclasses.replace(config.agent, precision=precision)
+    agent = make_merl(
+        agent_config,
+        space,
+        actions,
+        frame_stack=config.replay.frame_stack,
+        seed=0,
+        device=device,
+    )
+    batch = _random_batch(config, space, actions).to(device)
+
+    def update() -> None:
+        float(agent.update(batch)["critic_loss"])  # reading it waits for the device
+
+    update()
+    return _median_seconds(update)
+
+
+def _time_step(env: gymnasium.Env[Any, Any]) -> float:
+    env.reset(seed=0)
+    action = env.action_space.sample()
+
+    def steps() -> None:
+        for _ in range(MEASURED_STEPS):
+            env.step(action)
+
+    return _median_seconds(steps) / MEASURED_STEPS
+
+
+def _median_seconds(work: Callable[[], None]) -> float:
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return median(seconds)
+
+
+def _random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:
+    generator = torch.Generator().manual_seed(0)
+    size, stack = config.replay.batch_size, config.replay.frame_stack
+
+    def observation() -> dict[str, torch.Tensor]:
+        return {key: modality(box) for key, box in space.items()}
+
+    def modality(box: spaces.Space[Any]) -> torch.Tensor:
+        assert box.shape is not None
+        if is_image(box):
+            shape = (size, stack, *box.shape)
+            return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
+        return torch.randn((size, *box.shape), generator=generator)
+
+    return Batch(
+        observation(),
+        torch.rand((size, *actions.shape), generator=generator) * 2 - 1,
+        torch.rand(size, generator=generator),
+        torch.full((size,), 0.97),
+        observation(),
+    )

@@ -180,7 +180,7 @@ def test_every_sample_is_what_brute_force_makes_of_it(config, episodes):
 
 
 @pytest.mark.long
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=600, deadline=None)
 @given(configs, plans)
 def test_every_sample_is_what_brute_force_makes_of_it_long(config, episodes):
     brute_force(config, episodes)
@@ -375,7 +375,7 @@ def test_going_back_anywhere(config, episodes, data):
 
 
 @pytest.mark.long
-@settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=600, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(configs, plans, st.data())
 def test_going_back_anywhere_long(config, episodes, data):
     go_back_anywhere(config, episodes, data)
@@ -439,6 +439,8 @@ def test_opened_with_a_smaller_capacity_it_samples_only_the_newest(tmp_path):
     assert len(replay) == 7
     steps = run.account.held()[-7:]
     check_rows(replay.sample(7, Every()), run.account, steps)
+    run.replay = make(run.directory)
+    check(run.replay, run.account)  # and nothing is lost
 
 
 # Disk and memory
@@ -551,7 +553,8 @@ def test_growing_on_a_full_disk_changes_nothing(tmp_path, monkeypatch):
 
 
 def test_what_a_dead_process_had_begun_to_reserve_is_replaced(tmp_path):
-    (tmp_path / "moment.bin").write_bytes(b"\1" * 5000)
+    Run(tmp_path).play(5)
+    (tmp_path / "replay.json").unlink()
     run = Run(tmp_path)
     assert len(run.replay) == 0
     run.play(5)

@@ -12,6 +12,9 @@ In a directory each field is a file of its own, `<field>.bin`: the raw little-en
 (slots, *shape) in C order, memory-mapped. `replay.json` lists fields, types, shapes and the number
 of slots; it is written last, so a directory that has it is whole. An observation's key is quoted as
 in a URL: `observation.image.bin`, `observation.arm%2Fjoints.bin`.
+
+A process that is killed loses nothing that was written; a machine that loses power loses what came
+after the last `flush`. A checkpoint calls `flush` and keeps `state_dict`.
 """
 
 from __future__ import annotations
@@ -121,10 +124,8 @@ def check_fits(
     room = {"of memory are available": available_memory()}
     if directory is not None:
         where = existing_parent(directory)
-        held = sum(
-            file.stat().st_size for file in directory.glob("*.bin")
-        )  # reopened: already ours
-        room[f"of disk are free in {where}"] = free_disk(where) + held
+        ours = sum(file.stat().st_size for file in directory.glob("*.bin"))  # if it is opened again
+        room[f"of disk are free in {where}"] = free_disk(where) + ours
     what, least = min(room.items(), key=lambda item: item[1])
     need = replay_bytes(config, observation_space, action_space, steps)
     if need > least:
@@ -263,12 +264,7 @@ class Replay:
 
     def state_dict(self) -> dict[str, int | bool]:
         """The cursor and its counts as plain numbers; the moments stay where they are."""
-        return {
-            "moments": self._moments,
-            "steps": self._steps,
-            "first": self._first,
-            "open": self._open,
-        }
+        return {"moments": self._moments, "steps": self._steps, "open": self._open}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go back to what `state_dict` said; what was written since then is forgotten.
@@ -285,7 +281,7 @@ class Replay:
                 f"the replay does not hold moment {moments:,}, at which the checkpoint was taken: "
                 "it is not this run's, or was written to since; start a new run"
             )
-        self._take_over(moments, int(state["steps"]), int(state["first"]), bool(state["open"]))
+        self._take_over(moments, int(state["steps"]), bool(state["open"]))
 
     def _slot(self, moment: int) -> int:
         """Where the ring holds a moment."""
@@ -332,22 +328,25 @@ class Replay:
         """The newest moment that is no longer held."""
         return max(self._moments - self._slots, self._gap)
 
-    def _take_over(
-        self, moments: int, steps: int | None = None, first: int = 0, is_open: bool = False
-    ) -> None:
-        """Find the steps among the moments up to number `moments` that lie in the ring."""
+    def _take_over(self, moments: int, steps: int | None = None, in_progress: bool = False) -> None:
+        """Go on after moment number `moments`: find the steps that the ring holds up to there.
+
+        Args:
+            moments: moments ever written.
+            steps: steps ever taken; unknown, they are counted from the oldest that is held.
+            in_progress: the episode that the last moment belongs to goes on.
+        """
         stamps = self._data["moment"]
         stamps[stamps > moments] = 0  # else they would pass for what follows, if opened once more
         numbers = np.arange(max(0, moments - self._slots) + 1, moments + 1)
         slots = (numbers - 1) % self._slots
-        missing = numbers[stamps[slots] != numbers]
+        missing = numbers[stamps[slots] != numbers]  # overwritten since, or only half written
         self._gap = int(missing[-1]) if missing.size else 0
-        whole = numbers > self._gap
-        leads = whole[:-1] & (self._data["position"][slots[1:]] > 0)
+        leads = (numbers[:-1] > self._gap) & (self._data["position"][slots[1:]] > 0)
         sources = numbers[:-1][leads][-self.capacity :]
-        self._moments, self._open = moments, is_open
+        self._moments, self._open = moments, in_progress
         self._steps = len(sources) if steps is None else steps
-        self._first = max(first, self._steps - len(sources))
+        self._first = self._steps - len(sources)
         self._sources[np.arange(self._steps - len(sources), self._steps) % self.capacity] = sources
         self._forget()
 
@@ -429,6 +428,7 @@ def _field_name(key: str) -> str:
 
 
 def _check_batch(batch_size: int, capacity: int) -> None:
+    """Raise MerlError for a batch that the replay could never fill with different steps."""
     if batch_size > capacity:
         raise MerlError(
             f"replay.batch_size {batch_size} is larger than the replay of {capacity} steps: "

@@ -13,8 +13,9 @@ In a directory each field is a file of its own, `<field>.bin`: the raw little-en
 of slots; it is written last, so a directory that has it is whole. An observation's key is quoted as
 in a URL: `observation.image.bin`, `observation.arm%2Fjoints.bin`.
 
-A process that is killed loses nothing that was written; a machine that loses power loses what came
-after the last `flush`. A checkpoint calls `flush` and keeps `state_dict`.
+A process that is killed loses nothing that was written. A machine that loses power loses what came
+after the last `flush`, and where that had begun to overwrite old moments, those may be torn. A
+checkpoint calls `flush` and keeps `state_dict`.
 """
 
 from __future__ import annotations

@@ -199,7 +199,7 @@ def test_gymnasium_makes_every_task():
     register()
     assert set(ENV_IDS) == set(TASKS)
     settings = {"renderer": "warp", "observations": ("state",), "proprio": "full"}
-    env = gymnasium.make("merl/ReachDuplo-v0", **settings)
+    env = gymnasium.make("merl:merl/ReachDuplo-v0", **settings)
     assert env.unwrapped.config == EnvConfig(**settings)
     assert env.reset(seed=0)[0]["state"].shape == (55,)
     env.close()

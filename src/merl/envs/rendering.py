@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import importlib
-import logging
 import os
 import sys
 import tempfile
@@ -25,8 +24,6 @@ from numpy.typing import NDArray
 from merl.core import MerlError
 from merl.envs.config import RendererName
 from merl.tasks import simulator
-
-logger = logging.getLogger(__name__)
 
 Image = NDArray[np.uint8]
 
@@ -104,50 +101,41 @@ def _enable_opengl() -> None:
     """Give dm_control, which was imported without, an OpenGL backend.
 
     Raises:
-        MerlError: none works.
+        MerlError: there is none, or it does not work.
     """
-    wanted = os.environ.get("MUJOCO_GL")
-    on_screen = ("glfw",) if os.environ.get("DISPLAY") else ()
-    names = (wanted,) if wanted else ("egl", *on_screen, "osmesa")
-    with _opengl_lock:
-        if not any(_opengl_works(name) for name in names):
-            tried = f"MUJOCO_GL={wanted}" if wanted else ", ".join(names)
-            raise MerlError(
-                f"renderer 'gl' finds no OpenGL that works (tried {tried}): install the Debian "
-                "package libegl1 or libosmesa6, or use --renderer warp, which needs none"
-            )
-
-
-def _opengl_works(name: str) -> bool:
-    """Switch dm_control to a backend, if that can open a context."""
     render = importlib.import_module("dm_control._render")
-    if name == render.BACKEND and name != "off":
-        return True
-    libraries = _OPENGL_LIBRARIES.get(name, ())
-    if libraries and not any(_loads(library) for library in libraries):
-        return False
-    try:
-        _reload_opengl(name)
-        render.Renderer(1, 1).free()
-    except Exception as reason:  # every backend fails in its own way
-        logger.info("OpenGL through %s does not work: %s", name, reason)
-        _forget_opengl()
-        _reload_opengl("disabled")
-        return False
-    return True
+    name = _choose_opengl()
+    with _opengl_lock:
+        if name == render.BACKEND != "off":
+            return
+        try:
+            _reload_opengl(name)
+            render.Renderer(1, 1).free()
+        except Exception as reason:  # every backend fails in its own way
+            _reload_opengl("disabled")
+            raise MerlError(
+                f"renderer 'gl' finds no OpenGL that works (tried {name}): install the Debian "
+                "package libegl1, or libosmesa6 and set MUJOCO_GL=osmesa, or use --renderer warp, "
+                "which needs none"
+            ) from reason
+
+
+def _choose_opengl() -> str:
+    """The backend that `MUJOCO_GL` names, else the first whose library is there.
+
+    One choice and no second try: what a backend has loaded keeps the next one from working.
+    """
+    if os.environ.get("MUJOCO_GL"):
+        return os.environ["MUJOCO_GL"]
+    for name, libraries in _OPENGL_LIBRARIES.items():
+        if any(_loads(library) for library in libraries):
+            return name
+    return "glfw" if os.environ.get("DISPLAY") else "egl"
 
 
 def _reload_opengl(name: str) -> None:
-    with simulator.opengl_backend(name):
+    with simulator.environment(MUJOCO_GL=name):
         importlib.reload(importlib.import_module("dm_control._render"))
-
-
-def _forget_opengl() -> None:
-    """Undo what a backend that failed left behind, so that another one can be tried."""
-    os.environ.pop("PYOPENGL_PLATFORM", None)
-    for name in list(sys.modules):
-        if name.split(".")[0] == "OpenGL" or name.startswith("dm_control._render.pyopengl."):
-            del sys.modules[name]
 
 
 def _loads(library: str) -> bool:

@@ -39,17 +39,18 @@ def check_versions() -> None:
 
 
 @contextmanager
-def opengl_backend(name: str) -> Iterator[None]:
-    """Set `MUJOCO_GL`, which is read on import, to `name` for a while."""
-    before = os.environ.get("MUJOCO_GL")
-    os.environ["MUJOCO_GL"] = name
+def environment(**variables: str) -> Iterator[None]:
+    """Set environment variables for as long as something that reads them is imported."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["MUJOCO_GL"]
-        else:
-            os.environ["MUJOCO_GL"] = before
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 @contextmanager
@@ -68,6 +69,7 @@ def quiet_inverse_kinematics() -> Iterator[None]:
 
 
 check_versions()
-with opengl_backend("disabled"):
+with environment(MUJOCO_GL="disabled", DISABLE_RENDER_THREAD_OFFLOADING="1"):
     importlib.import_module("mujoco")
-    importlib.import_module("dm_control._render")
+    # Rendering in the calling thread: a thread of dm_control's own fails when Python exits first.
+    importlib.import_module("dm_control._render.executor")

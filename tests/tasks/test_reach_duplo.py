@@ -16,10 +16,7 @@ class Episodes:
         self.physics = self.task.compile()
 
     def start(self, seed):
-        random_state = np.random.RandomState(seed)
-        random_state.uniform()
-        with self.physics.reset_context():
-            self.task.initialize_episode(self.physics, random_state)
+        self.task.start_episode(self.physics, np.random.RandomState(seed))
         return self.physics
 
 

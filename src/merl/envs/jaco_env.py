@@ -73,10 +73,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise MerlError("the environment is closed: make another one")
         super().reset(seed=seed)
         random_state = np.random.RandomState(self.np_random.integers(2**32, dtype=np.uint32))
-        # dm_control recompiles the model here, which draws one number and changes nothing.
-        random_state.uniform()
-        with self._physics.reset_context():
-            self.task.initialize_episode(self._physics, random_state)
+        self.task.start_episode(self._physics, random_state)
         self._steps_left = EPISODE_STEPS
         return self._observe(), self._info(self.task.reward_terms(self._physics))
 

@@ -96,16 +96,26 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         return self._arena
 
     def compile(self) -> mjcf.Physics:
-        """The task's simulation.
-
-        One serves all episodes, because nothing in the model varies from episode to episode.
-        """
-        unused = np.random.RandomState(0)
-        for entity in self._arena.iter_entities():
-            entity.initialize_episode_mjcf(unused)  # sets the size of the brick's studs
+        """The task's simulation; one serves all episodes, see `start_episode`."""
+        random_state = np.random.RandomState(0)
+        self._vary_model(random_state)
         physics = mjcf.Physics.from_mjcf_model(self._arena.mjcf_model)
-        self.after_compile(physics, unused)
+        self.after_compile(physics, random_state)
         return physics
+
+    def start_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        """Start an episode as `composer.Environment` does, without compiling the model again.
+
+        Nothing in the model varies between episodes: the brick draws the size of its studs from a
+        range without width. The draw is made all the same, so that the starts are dm_control's.
+        """
+        self._vary_model(random_state)
+        with physics.reset_context():
+            self.initialize_episode(physics, random_state)
+
+    def _vary_model(self, random_state: np.random.RandomState) -> None:
+        for entity in self._arena.iter_entities():
+            entity.initialize_episode_mjcf(random_state)
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Note where in MuJoCo's arrays the numbers lie that every step reads."""

@@ -1,0 +1,270 @@
+"""Between the package and the reference: a case, its agent, its chance, and both vocabularies."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import reference
+import torch
+from gymnasium import spaces
+from torch import Tensor, nn
+
+from merl.agents.ddpg import DDPG, Draws
+from merl.agents.merl import MERLConfig, make_merl
+from merl.core import Batch
+
+STACK = 3
+ACTIONS = 6
+GAMMA = 0.99
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is learnt from: the modalities' shapes, and how MERL is configured."""
+
+    name: str
+    config: MERLConfig
+    images: Mapping[str, tuple[int, int, int]] = field(
+        default_factory=lambda: {"image": (24, 28, 3)}
+    )
+    vectors: Mapping[str, int] = field(default_factory=lambda: {"proprio": 7})
+    batch: int = 8
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        images = {k: spaces.Box(0, 255, shape, np.uint8) for k, shape in self.images.items()}
+        vectors = {
+            k: spaces.Box(-np.inf, np.inf, (n,), np.float32) for k, n in self.vectors.items()
+        }
+        return spaces.Dict(images | vectors)
+
+    @property
+    def spec(self) -> reference.Spec:
+        """The config in the reference's words."""
+        c = self.config
+        fusion = ("psi_critic",) if c.target == "heads_and_fusion" else ()
+        return reference.Spec(
+            modalities=(*self.images, *self.vectors),
+            strides=c.conv_strides,
+            vector_layers=2 if c.vector_encoder_dim else 0,
+            layers=c.head_layers,
+            squash=c.squash,
+            pad=c.shift_pad,
+            sigma=c.noise_std,
+            clip=c.noise_clip,
+            tau=c.tau,
+            learning_rate=c.learning_rate,
+            averaged=(*fusion, "phi_1", "phi_2"),
+        )
+
+    def agent(self, seed: int = 0) -> DDPG:
+        """As the package makes it."""
+        return make_merl(
+            self.config,
+            self.observation_space,
+            spaces.Box(-1, 1, (ACTIONS,), np.float32),
+            frame_stack=STACK,
+            seed=seed,
+            device=torch.device("cpu"),
+        )
+
+    def batch_of(self, seed: int, dtype: torch.dtype = torch.float32) -> Batch:
+        """Pictures that are smooth but for their grain, and discounts of both kinds."""
+        rng = np.random.default_rng(seed)
+
+        def observation() -> dict[str, Tensor]:
+            images = {
+                k: torch.from_numpy(_pictures(rng, (self.batch, STACK, *shape)))
+                for k, shape in self.images.items()
+            }
+            vectors = {
+                k: torch.from_numpy(rng.normal(size=(self.batch, n)).astype(np.float32)).to(dtype)
+                for k, n in self.vectors.items()
+            }
+            return images | vectors
+
+        steps = rng.integers(1, 4, self.batch)  # m, less than n = 3 where an episode is over sooner
+        discount = np.where(np.arange(self.batch) % 3 == 0, 0.0, GAMMA**steps)
+        return Batch(
+            observation=observation(),
+            action=_tensor(rng.uniform(-1, 1, (self.batch, ACTIONS)), dtype),
+            reward=_tensor(rng.uniform(0, 3, self.batch), dtype),
+            discount=_tensor(discount, dtype),
+            next_observation=observation(),
+        )
+
+    def chance_of(self, seed: int, dtype: torch.dtype = torch.float64) -> reference.Chance:
+        generator = torch.Generator().manual_seed(seed)
+
+        def shifts() -> dict[str, Tensor]:
+            size = (self.batch, 2)
+            return {
+                k: torch.randint(0, 2 * self.config.shift_pad + 1, size, generator=generator)
+                for k in self.images
+            }
+
+        def noise() -> Tensor:
+            return torch.randn(self.batch, ACTIONS, generator=generator).to(dtype)
+
+        return reference.Chance(shifts(), shifts(), noise(), noise())
+
+
+def _pictures(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    brightness = rng.uniform(40, 215, (*shape[:2], 1, 1, shape[-1]))
+    return np.clip(brightness + rng.normal(0, 30, shape), 0, 255).astype(np.uint8)
+
+
+def _tensor(values: np.ndarray, dtype: torch.dtype) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32)).to(dtype)
+
+
+# -- the package's state, made as awkward as a state in mid-training -----------------------------
+
+
+def double(agent: DDPG) -> DDPG:
+    """The same agent in float64, Adam's moments included."""
+    agent.networks.double()
+    agent.critic_target.double()
+    for optimizer in (agent.critic_optimizer, agent.actor_optimizer):
+        for state in optimizer.state.values():
+            state |= {name: state[name].double() for name in ("exp_avg", "exp_avg_sq")}
+    return agent
+
+
+@torch.no_grad()
+def weather(agent: DDPG, seed: int = 0) -> None:
+    """Biases and norms away from 0 and 1, a target unlike the critic, actions at the clamp."""
+    generator = torch.Generator().manual_seed(seed)
+    for module in (agent.networks, agent.critic_target):
+        for p in module.parameters():
+            size = 0.3 * p.std() if p.ndim > 1 else 0.1
+            p += size * torch.randn(p.shape, generator=generator).to(p.dtype)
+    agent.networks.actor.layers[-1].weight.mul_(3.0)
+
+
+@torch.no_grad()
+def warm(agent: DDPG, steps: int = 7, seed: int = 0) -> None:
+    """Give Adam a past: second moments over many decades, so that its epsilon counts too."""
+    generator = torch.Generator().manual_seed(seed)
+    for optimizer in (agent.critic_optimizer, agent.actor_optimizer):
+        for p in optimizer.param_groups[0]["params"]:
+            # In the memory order of the parameter: a fused Adam walks them side by side.
+            m, v = torch.empty_like(p), torch.empty_like(p)
+            v.copy_(10 ** (-16 + 14 * torch.rand(p.shape, generator=generator)))
+            m.copy_(v.sqrt() * torch.randn(p.shape, generator=generator))
+            step = torch.tensor(float(steps))
+            optimizer.state[p] = {"step": step, "exp_avg": m, "exp_avg_sq": v}
+
+
+# -- from the package's words to the reference's -------------------------------------------------
+
+_NAMES = [
+    (
+        r"encoders\.images\.(\w+)\.convolutions\.(\d+)\.",
+        lambda m: f"xi.{m[1]}.{int(m[2]) // 2 + 1}.",
+    ),
+    (r"encoders\.vectors\.(\w+)\.layers\.(\d+)\.", lambda m: f"zeta.{m[1]}.{int(m[2]) // 2 + 1}."),
+    (r"(critic|actor)_fusion\.projections\.(\w+)\.", r"psi_\1.\2."),
+    (r"(critic|actor)_fusion\.norms\.(\w+)\.", r"psi_\1.\2.norm."),
+    (r"critic\.q([12])\.(\d+)\.(linear\.)?", lambda m: f"phi_{m[1]}.{int(m[2]) + 1}."),
+    (r"actor\.layers\.(\d+)\.(linear\.)?", lambda m: f"theta.{int(m[1]) + 1}."),
+    (r"norm\.weight", "norm.scale"),
+    (r"norm\.bias", "norm.shift"),
+]
+
+
+def word(name: str) -> str:
+    for pattern, paper in _NAMES:
+        name = re.sub(pattern, paper, name)
+    return name
+
+
+def named(agent: DDPG) -> dict[str, nn.Parameter]:
+    """Every parameter of the agent under the reference's name."""
+    networks = {word(name): p for name, p in agent.networks.named_parameters()}
+    averages = {f"bar_{word(name)}": p for name, p in agent.critic_target.named_parameters()}
+    return networks | averages
+
+
+def weights_of(agent: DDPG) -> reference.Weights:
+    return {name: p.detach().to(torch.float64, copy=True) for name, p in named(agent).items()}
+
+
+def gradients_of(agent: DDPG) -> reference.Weights:
+    return {n: p.grad.to(torch.float64) for n, p in named(agent).items() if p.grad is not None}
+
+
+def moments_of(optimizer: torch.optim.Optimizer, agent: DDPG) -> reference.Moments:
+    mine = {n: optimizer.state[p] for n, p in named(agent).items() if p in optimizer.state}
+    steps = {int(state["step"]) for state in mine.values()}
+    return reference.Moments(
+        t=steps.pop() if steps else 0,
+        m={n: state["exp_avg"].to(torch.float64, copy=True) for n, state in mine.items()},
+        v={n: state["exp_avg_sq"].to(torch.float64, copy=True) for n, state in mine.items()},
+    )
+
+
+def state_of(agent: DDPG) -> reference.State:
+    """The agent's state as the reference's, before or after its first update."""
+    weights = weights_of(agent)
+    if not agent.critic_optimizer.state:
+        return reference.start(weights)
+    critic, actor = (
+        moments_of(optimizer, agent)
+        for optimizer in (agent.critic_optimizer, agent.actor_optimizer)
+    )
+    return reference.State(weights, critic, actor)
+
+
+def sample_of(batch: Batch) -> reference.Sample:
+    def wide(x: Tensor) -> Tensor:
+        return x if x.dtype == torch.uint8 else x.to(torch.float64)
+
+    return reference.Sample(
+        o={k: wide(v) for k, v in batch.observation.items()},
+        a=wide(batch.action),
+        r=wide(batch.reward),
+        discount=wide(batch.discount),
+        o_next={k: wide(v) for k, v in batch.next_observation.items()},
+    )
+
+
+def draws_of(chance: reference.Chance, config: MERLConfig, dtype: torch.dtype) -> Draws:
+    """The package takes its noise scaled and clipped."""
+
+    def clipped(noise: Tensor) -> Tensor:
+        sigma, c = config.noise_std, config.noise_clip
+        return (sigma * noise).clamp(-c, c).to(dtype)
+
+    return Draws(
+        shifts=chance.shift,
+        next_shifts=chance.shift_next,
+        next_noise=clipped(chance.noise_next),
+        actor_noise=clipped(chance.noise),
+    )
+
+
+# -- how far apart -------------------------------------------------------------------------------
+
+
+def error(x: Tensor, truth: Tensor) -> float:
+    """|x - truth| / |truth|, of the whole tensor."""
+    return float((x.to(torch.float64) - truth).norm() / truth.norm())
+
+
+def errors(x: reference.Weights, truth: reference.Weights) -> dict[str, float]:
+    assert x.keys() == truth.keys()
+    return {name: error(x[name], truth[name]) for name in truth}
+
+
+def beyond(errors: Mapping[str, float], bound: float) -> dict[str, float]:
+    """Those at or over the bound; not-a-number is over any."""
+    return {name: e for name, e in errors.items() if not e < bound}
+
+
+def snapshot(parameters: Iterator[nn.Parameter]) -> list[tuple[Tensor, Tensor | None]]:
+    """Values and gradients, to be compared bit for bit."""
+    return [(p.detach().clone(), None if p.grad is None else p.grad.clone()) for p in parameters]

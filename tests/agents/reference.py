@@ -1,0 +1,319 @@
+"""MERL's update, written a second time from the paper's equations, to hold the package against.
+
+It shares nothing with the package: no layer, no optimizer, no helper. Every weight lives in one
+flat dict under the paper's symbol for it, every draw of chance is handed in, and one update is a
+pure function from a state to the next. Where the paper leaves a choice open, what was chosen is in
+`docs/paper.md`.
+
+    symbol          what it is
+    xi.KEY          image encoder f of one camera
+    zeta.KEY        proprioception encoder g of one vector (no weights if it is the identity)
+    psi_critic.KEY  multimodal fusion h for the critic, one modality
+    psi_actor.KEY   multimodal fusion h for the actor, one modality
+    theta           actor pi
+    phi_1, phi_2    critic Q
+    bar_NAME        the exponential moving average of NAME
+
+The gradients come from autograd; everything forward, and Adam, is spelled out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+Weights = dict[str, Tensor]
+Modalities = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What Table 1 and appendix C.1 fix; `averaged` names the weights that have an average."""
+
+    modalities: tuple[str, ...] = ("image", "proprio")  # in the order of concatenation
+    strides: tuple[int, ...] = (2, 1, 1, 1)
+    vector_layers: int = 0  # 0 is the identity, which the final version of MERL uses
+    layers: int = 3  # of the actor and of each Q, the output layer counted
+    squash: str = "tanh"  # or "simplex"
+    simplex_group: int = 8
+    pad: int = 4
+    sigma: float = 0.2
+    clip: float = 0.3
+    tau: float = 0.01
+    learning_rate: float = 1e-4
+    averaged: tuple[str, ...] = ("phi_1", "phi_2")  # with "psi_critic" in front: DrQ-v2's target
+
+
+@dataclass(frozen=True)
+class Sample:
+    """(o_t, a_t, r_{t:t+n-1}, o_{t+n}) for a mini-batch: images (B, K, H, W, C), vectors (B, n)."""
+
+    o: Modalities
+    a: Tensor  # (B, A)
+    r: Tensor  # (B,) the discounted sum of the rewards
+    discount: Tensor  # (B,) gamma^n, or what stands in its place at the end of an episode
+    o_next: Modalities
+
+
+@dataclass(frozen=True)
+class Chance:
+    """Every random number of one update."""
+
+    shift: dict[str, Tensor]  # (B, 2) per image key: row and column of the crop of o_t
+    shift_next: dict[str, Tensor]  # the same for o_{t+n}
+    noise: Tensor  # (B, A) standard normal, for a_t in the actor's loss
+    noise_next: Tensor  # (B, A) standard normal, for a_{t+n} in the target
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Adam's state: how many steps were made, and two moments of every gradient."""
+
+    t: int
+    m: Weights
+    v: Weights
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that the next update depends on, but for the sample and the chance."""
+
+    weights: Weights
+    critic_adam: Moments
+    actor_adam: Moments
+
+
+@dataclass(frozen=True)
+class Report:
+    """What one update computed on the way."""
+
+    y: Tensor  # (B,)
+    critic_loss: Tensor
+    actor_loss: Tensor
+    gradients: Weights
+
+
+# -- the layers, (B, ...) ------------------------------------------------------------------------
+
+
+def linear(w: Weights, name: str, x: Tensor) -> Tensor:
+    return x @ w[f"{name}.weight"].T + w[f"{name}.bias"]
+
+
+def layer_norm(w: Weights, name: str, x: Tensor) -> Tensor:
+    """Ba et al. (2016): over the features of each sample, with the biased variance."""
+    mean = x.mean(-1, keepdim=True)
+    variance = ((x - mean) ** 2).mean(-1, keepdim=True)
+    return (x - mean) / (variance + 1e-5).sqrt() * w[f"{name}.scale"] + w[f"{name}.shift"]
+
+
+def relu(x: Tensor) -> Tensor:
+    return x * (x > 0)
+
+
+def tanh(x: Tensor) -> Tensor:
+    return 1 - 2 / (torch.exp(2 * x) + 1)
+
+
+def simplex(x: Tensor, group: int) -> Tensor:
+    """A softmax within every group of neighbours."""
+    e = x.unflatten(-1, (-1, group)).exp()  # (B, groups, group)
+    return (e / e.sum(-1, keepdim=True)).flatten(-2)
+
+
+def clamp_straight_through(a: Tensor) -> Tensor:
+    """The value is clamped to [-1, 1]; the gradient is the identity's."""
+    with torch.no_grad():
+        excess = a - torch.minimum(torch.maximum(a, -torch.ones_like(a)), torch.ones_like(a))
+    return a - excess
+
+
+# -- section 4.1: aug, f, g, h -------------------------------------------------------------------
+
+
+def aug(image: Tensor, shift: Tensor, pad: int) -> Tensor:
+    """Pad each side with its edge's pixels and crop at `shift`, one crop for the whole stack.
+
+    The crop's corner is a whole pixel, so the bilinear interpolation of section 4.1 is the pixel.
+    """
+    height, width = image.shape[-3:-1]  # (B, K, H, W, C)
+    rows = torch.arange(-pad, height + pad).clamp(0, height - 1)
+    columns = torch.arange(-pad, width + pad).clamp(0, width - 1)
+    padded = image[:, :, rows][:, :, :, columns]
+    crops = [
+        stack[:, top : top + height, left : left + width]
+        for stack, (top, left) in zip(padded, shift.tolist(), strict=True)
+    ]
+    return torch.stack(crops)
+
+
+def f(w: Weights, key: str, image: Tensor, spec: Spec) -> Tensor:
+    """C.1's image encoder: 3x3 convolutions, a ReLU after each. Pixels enter as 0..1 less 0.5."""
+    batch, frames, height, width, channels = image.shape
+    x = image.to(w[f"xi.{key}.1.weight"].dtype) / 255 - 0.5
+    x = x.permute(0, 1, 4, 2, 3).reshape(batch, frames * channels, height, width)
+    for i, stride in enumerate(spec.strides, 1):
+        x = relu(conv2d(x, w[f"xi.{key}.{i}.weight"], w[f"xi.{key}.{i}.bias"], stride))
+    return x.permute(0, 2, 3, 1).flatten(1)  # rows, columns, channels
+
+
+def g(w: Weights, key: str, vector: Tensor, spec: Spec) -> Tensor:
+    """C.1's proprioception encoder: the identity, or an MLP with a ReLU after each layer."""
+    x = vector.to(w["theta.1.weight"].dtype)
+    for i in range(1, spec.vector_layers + 1):
+        x = relu(linear(w, f"zeta.{key}.{i}", x))
+    return x
+
+
+def encode(w: Weights, o: Modalities, shift: dict[str, Tensor], spec: Spec) -> Modalities:
+    """f_xi(aug(o^image)) and g_zeta(o^prop)."""
+    return {
+        key: f(w, key, aug(o[key], shift[key], spec.pad), spec)
+        if key in shift
+        else g(w, key, o[key], spec)
+        for key in spec.modalities
+    }
+
+
+def h(w: Weights, psi: str, r: Modalities, spec: Spec) -> Tensor:
+    """C.1's fusion: for each modality one layer, LayerNorm, tanh; then concatenated, (B, d)."""
+
+    def one(key: str) -> Tensor:
+        x = layer_norm(w, f"{psi}.{key}.norm", linear(w, f"{psi}.{key}", r[key]))
+        return tanh(x) if spec.squash == "tanh" else simplex(x, spec.simplex_group)
+
+    return torch.cat([one(key) for key in spec.modalities], -1)
+
+
+# -- section 4.2: pi and Q -----------------------------------------------------------------------
+
+
+def mlp(w: Weights, name: str, x: Tensor, layers: int) -> Tensor:
+    """C.1: LayerNorm and ReLU after each layer except the last."""
+    for i in range(1, layers):
+        x = relu(layer_norm(w, f"{name}.{i}.norm", linear(w, f"{name}.{i}", x)))
+    return linear(w, f"{name}.{layers}", x)
+
+
+def pi(w: Weights, r_mm: Tensor, noise: Tensor, spec: Spec) -> Tensor:
+    """pi_theta(r) + epsilon, epsilon ~ clip(N(0, sigma^2), -c, c); actions live in [-1, 1]."""
+    epsilon = (spec.sigma * noise).clamp(-spec.clip, spec.clip)
+    return clamp_straight_through(tanh(mlp(w, "theta", r_mm, spec.layers)) + epsilon)
+
+
+def q(w: Weights, phi: str, r_mm: Tensor, a: Tensor, spec: Spec) -> Tensor:
+    """Q_phi(r, a), (B,)."""
+    return mlp(w, phi, torch.cat([r_mm, a], -1), spec.layers).squeeze(-1)
+
+
+# -- equations 1 and 2 ---------------------------------------------------------------------------
+
+
+def target(w: Weights, sample: Sample, chance: Chance, spec: Spec) -> Tensor:
+    """y, below equation 1: the Q-heads are averages, everything that encodes is most recent."""
+    psi = "bar_psi_critic" if "psi_critic" in spec.averaged else "psi_critic"
+    r_next = encode(w, sample.o_next, chance.shift_next, spec)
+    a_next = pi(w, h(w, "psi_actor", r_next, spec), chance.noise_next, spec)
+    r_mm_next = h(w, psi, r_next, spec)
+    q_next = torch.minimum(
+        q(w, "bar_phi_1", r_mm_next, a_next, spec), q(w, "bar_phi_2", r_mm_next, a_next, spec)
+    )
+    return sample.r + sample.discount * q_next
+
+
+def critic_loss(w: Weights, r: Modalities, a: Tensor, y: Tensor, spec: Spec) -> Tensor:
+    """Equation 1, the sum over k."""
+    r_mm = h(w, "psi_critic", r, spec)
+    errors = [q(w, phi, r_mm, a, spec) - y for phi in ("phi_1", "phi_2")]
+    return sum((error**2).mean() for error in errors)
+
+
+def actor_loss(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> Tensor:
+    """Equation 2."""
+    a = pi(w, h(w, "psi_actor", r, spec), noise, spec)
+    r_mm = h(w, "psi_critic", r, spec)
+    return -torch.minimum(q(w, "phi_1", r_mm, a, spec), q(w, "phi_2", r_mm, a, spec)).mean()
+
+
+# -- algorithm 1 ---------------------------------------------------------------------------------
+
+CRITIC_LEARNS = ("xi", "zeta", "psi_critic", "phi_1", "phi_2")
+ACTOR_LEARNS = ("psi_actor", "theta")
+
+
+def of(weights: Iterable[str], symbols: Iterable[str]) -> list[str]:
+    """The names that belong to one of the paper's symbols."""
+    return [name for name in weights if name.split(".")[0] in tuple(symbols)]
+
+
+def gradients(loss: Callable[[Weights], Tensor], w: Weights, names: list[str]) -> Weights:
+    """Of a loss with respect to the named weights, and only them."""
+    leaves = {name: w[name].detach().clone().requires_grad_() for name in names}
+    return dict(
+        zip(names, torch.autograd.grad(loss(w | leaves), list(leaves.values())), strict=True)
+    )
+
+
+def adam(w: Weights, moments: Moments, g: Weights, learning_rate: float) -> tuple[Weights, Moments]:
+    """Kingma & Ba (2015), algorithm 1, with their defaults."""
+    beta_1, beta_2, eps, t = 0.9, 0.999, 1e-8, moments.t + 1
+    m = {name: beta_1 * moments.m[name] + (1 - beta_1) * g[name] for name in g}
+    v = {name: beta_2 * moments.v[name] + (1 - beta_2) * g[name] ** 2 for name in g}
+    moved = {
+        name: w[name]
+        - learning_rate * (m[name] / (1 - beta_1**t)) / ((v[name] / (1 - beta_2**t)).sqrt() + eps)
+        for name in g
+    }
+    return w | moved, Moments(t, m, v)
+
+
+def average(w: Weights, spec: Spec) -> Weights:
+    """bar_phi <- (1 - tau) bar_phi + tau phi."""
+    return w | {
+        f"bar_{name}": (1 - spec.tau) * w[f"bar_{name}"] + spec.tau * w[name]
+        for name in of(w, spec.averaged)
+    }
+
+
+def update(state: State, sample: Sample, chance: Chance, spec: Spec) -> tuple[State, Report]:
+    """UPDATECRITIC, then UPDATEACTOR on the same sample.
+
+    The actor sees the features of o_t from before the critic's step, as constants; the critic that
+    judges it, fusion and heads, is the one from after the step.
+    """
+    w = state.weights
+    y = target(w, sample, chance, spec)
+    features = encode(w, sample.o, chance.shift, spec)
+
+    def eq_1(w: Weights) -> Tensor:
+        return critic_loss(w, encode(w, sample.o, chance.shift, spec), sample.a, y, spec)
+
+    loss_1, g_1 = eq_1(w), gradients(eq_1, w, of(w, CRITIC_LEARNS))
+    w, critic_adam = adam(w, state.critic_adam, g_1, spec.learning_rate)
+    w = average(w, spec)
+
+    def eq_2(w: Weights) -> Tensor:
+        return actor_loss(w, features, chance.noise, spec)
+
+    loss_2, g_2 = eq_2(w), gradients(eq_2, w, of(w, ACTOR_LEARNS))
+    w, actor_adam = adam(w, state.actor_adam, g_2, spec.learning_rate)
+
+    return State(w, critic_adam, actor_adam), Report(y, loss_1, loss_2, g_1 | g_2)
+
+
+def start(weights: Weights) -> State:
+    """Adam before its first step."""
+
+    def zeros(symbols: tuple[str, ...]) -> Moments:
+        names = of(weights, symbols)
+        return Moments(
+            0,
+            {name: torch.zeros_like(weights[name]) for name in names},
+            {name: torch.zeros_like(weights[name]) for name in names},
+        )
+
+    return State(dict(weights), zeros(CRITIC_LEARNS), zeros(ACTOR_LEARNS))

@@ -1,0 +1,102 @@
+"""MERL's declaration: Table 1, which senses it takes, and what it refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from merl.agents.ddpg import DDPG
+from merl.agents.merl import MERLConfig, make_merl, modalities
+from merl.core import MerlError
+
+SPACE = spaces.Dict(
+    {
+        "image": spaces.Box(0, 255, (84, 84, 3), np.uint8),
+        "proprio": spaces.Box(-np.inf, np.inf, (24,), np.float32),
+        "state": spaces.Box(-np.inf, np.inf, (40,), np.float32),
+    }
+)
+
+
+def make(config: MERLConfig, space: spaces.Dict = SPACE) -> DDPG:
+    action_space = spaces.Box(-1, 1, (9,), np.float32)
+    device = torch.device("cpu")
+    return make_merl(config, space, action_space, frame_stack=3, seed=0, device=device)
+
+
+def test_table_1() -> None:
+    config = MERLConfig()
+    assert config.learning_rate == 1e-4
+    assert config.tau == 0.01
+    assert config.noise_std == 0.2
+    assert config.noise_clip == 0.3
+    assert config.hidden_dim == 1024
+    assert config.latent_dim == 128
+    assert (config.shift_pad, config.conv_channels, config.conv_strides) == (4, 32, (2, 1, 1, 1))
+    assert (config.target, config.squash, config.vector_encoder_dim) == ("heads", "tanh", 0)
+
+
+def test_the_papers_networks() -> None:
+    """C.1 in numbers of weights."""
+
+    def size(module: torch.nn.Module) -> int:
+        return sum(p.numel() for p in module.parameters())
+
+    def layer(n: int, m: int, norm: bool = True) -> int:
+        return n * m + m + 2 * m * norm
+
+    networks = make(MERLConfig(head_layers=6)).networks
+    assert size(networks.encoders) == (27 * 3 + 1) * 32 + 3 * (9 * 32 + 1) * 32
+    fusion = layer(39_200, 64) + layer(24, 64)
+    assert size(networks.critic_fusion) == size(networks.actor_fusion) == fusion
+    hidden = 4 * layer(1024, 1024)
+    assert size(networks.actor) == layer(128, 1024) + hidden + layer(1024, 9, norm=False)
+    one = layer(128 + 9, 1024) + hidden + layer(1024, 1, norm=False)
+    assert size(networks.critic) == 2 * one
+
+
+def test_all_but_the_state_is_sensed() -> None:
+    assert modalities(MERLConfig(), SPACE) == (("image",), ("proprio",))
+    assert modalities(MERLConfig(vectors=("state",)), SPACE) == (("image",), ("state",))
+    assert modalities(MERLConfig(images=()), SPACE) == ((), ("proprio",))
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        ({"images": ("camera",)}, "names 'camera'"),
+        ({"images": ("proprio",)}, "names 'proprio'"),
+        ({"vectors": ("joints",)}, "names 'joints'"),
+        ({"images": (), "vectors": ()}, "nothing to sense"),
+        ({"latent_dim": 127}, "127 does not split evenly"),
+        ({"conv_strides": (4, 4, 4, 4)}, "84x84 pixels is too small"),
+    ],
+)
+def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str) -> None:
+    with pytest.raises(MerlError, match=says):
+        make(MERLConfig(**config))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("learning_rate", 0.0),
+        ("learning_rate", float("nan")),
+        ("tau", 0.0),
+        ("tau", 1.01),
+        ("noise_std", -0.1),
+        ("noise_clip", -0.1),
+        ("latent_dim", 0),
+        ("hidden_dim", 0),
+        ("head_layers", 0),
+        ("conv_channels", 0),
+        ("shift_pad", -1),
+    ],
+)
+def test_a_bad_number_is_named(name: str, value: float) -> None:
+    with pytest.raises(MerlError, match=f"agent.{name.replace('_', '-')} must .* not {value}"):
+        MERLConfig(**{name: value})

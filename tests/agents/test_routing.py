@@ -1,0 +1,150 @@
+"""Which loss moves which weights: C.1's last sentences on each network, and Algorithm 1."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from bridge import Case, double, draws_of, named, snapshot, weather, weights_of
+
+from merl.agents.ddpg import DDPG
+from merl.agents.merl import MERLConfig
+
+CONFIG = MERLConfig(
+    latent_dim=32, conv_channels=8, hidden_dim=32, vector_encoder_dim=16, precision="fp32"
+)
+CASE = Case("mlp", CONFIG)
+BOTH_TARGETS = pytest.mark.parametrize("target", ["heads", "heads_and_fusion"])
+CRITICS = ("encoders", "critic_fusion", "critic")
+ACTORS = ("actor_fusion", "actor")
+
+
+def agent_in_training(target: str = "heads") -> DDPG:
+    """After one update, so that every network has a gradient to lose."""
+    agent = replace(CASE, config=replace(CONFIG, target=target)).agent()
+    weather(agent)
+    agent.update(CASE.batch_of(0))
+    return agent
+
+
+def update_critic(agent: DDPG) -> None:
+    batch, draws = CASE.batch_of(1), draws_of(CASE.chance_of(1), CONFIG, torch.float32)
+    encoders = agent.networks.encoders
+    encoded = encoders(batch.observation, draws.shifts)
+    with torch.no_grad():
+        next_encoded = encoders(batch.next_observation, draws.next_shifts)
+    agent.update_critic(encoded, next_encoded, batch, draws.next_noise)
+
+
+def update_actor(agent: DDPG, *, detached: bool = True) -> None:
+    batch, draws = CASE.batch_of(1), draws_of(CASE.chance_of(1), CONFIG, torch.float32)
+    encoded = agent.networks.encoders(batch.observation, draws.shifts)
+    if detached:
+        encoded = {key: features.detach() for key, features in encoded.items()}
+    agent.update_actor(encoded, draws.actor_noise)
+
+
+def same(before: list, after: list) -> bool:
+    """Bit for bit, the values and the gradients."""
+    return all(
+        torch.equal(p, q) and ((g is None and h is None) or torch.equal(g, h))
+        for (p, g), (q, h) in zip(before, after, strict=True)
+    )
+
+
+@pytest.mark.parametrize("detached", [True, False])
+def test_the_actors_loss_moves_actor_and_its_fusion_alone(detached: bool) -> None:
+    agent = agent_in_training()
+    still = [getattr(agent.networks, name) for name in CRITICS] + [agent.critic_target]
+    before = [snapshot(module.parameters()) for module in still]
+    moving = {
+        n: p.detach().clone() for n, p in named(agent).items() if n.startswith(("psi_a", "the"))
+    }
+    update_actor(agent, detached=detached)
+    assert all(map(same, before, [snapshot(module.parameters()) for module in still]))
+    assert moving
+    assert not any(torch.equal(p, named(agent)[name]) for name, p in moving.items())
+
+
+def test_the_critics_loss_moves_critic_its_fusion_and_the_encoders() -> None:
+    agent = agent_in_training()
+    still = [getattr(agent.networks, name) for name in ACTORS] + [agent.critic_target]
+    before = [snapshot(module.parameters()) for module in still]
+    symbols = ("xi", "zeta", "psi_c", "phi")
+    moving = {n: p.detach().clone() for n, p in named(agent).items() if n.startswith(symbols)}
+    update_critic(agent)
+    assert all(map(same, before, [snapshot(module.parameters()) for module in still]))
+    assert {name.split(".")[0] for name in moving} == {"xi", "zeta", "psi_critic", "phi_1", "phi_2"}
+    assert not any(torch.equal(p, named(agent)[name]) for name, p in moving.items())
+
+
+@BOTH_TARGETS
+def test_the_target_moves_by_tau(target: str) -> None:
+    agent = double(agent_in_training(target))
+    tau, before = agent.config.tau, weights_of(agent)
+    agent.update_target()
+    after = weights_of(agent)
+    for name in before:
+        if name.startswith("bar_"):
+            recent = before[name.removeprefix("bar_")]
+            expected = (1 - tau) * before[name] + tau * recent
+            torch.testing.assert_close(after[name], expected, rtol=1e-13, atol=1e-15)
+            assert not torch.equal(before[name], after[name])
+        else:
+            assert torch.equal(before[name], after[name])
+
+
+@BOTH_TARGETS
+def test_one_update_moves_the_target_once(target: str) -> None:
+    agent = double(agent_in_training(target))
+    before = weights_of(agent)
+    agent.learn(CASE.batch_of(2, torch.float64), draws_of(CASE.chance_of(2), CONFIG, torch.float64))
+    after = weights_of(agent)
+    for name in [name for name in before if name.startswith("bar_")]:
+        recent = after[name.removeprefix("bar_")]  # the critic's step came first
+        expected = 0.99 * before[name] + 0.01 * recent
+        torch.testing.assert_close(after[name], expected, rtol=1e-13, atol=1e-15)
+
+
+def test_tau_of_one_copies() -> None:
+    case = replace(CASE, config=replace(CONFIG, tau=1.0))
+    agent = case.agent()
+    weather(agent)
+    agent.update(case.batch_of(0))
+    weights = weights_of(agent)
+    for name in weights:
+        if name.startswith("bar_"):
+            torch.testing.assert_close(weights[name], weights[name.removeprefix("bar_")])
+
+
+def test_what_has_an_average() -> None:
+    def averaged(target: str) -> set[str]:
+        names = weights_of(agent_in_training(target))
+        return {name.split(".")[0] for name in names if name.startswith("bar_")}
+
+    assert averaged("heads") == {"bar_phi_1", "bar_phi_2"}
+    assert averaged("heads_and_fusion") == {"bar_psi_critic", "bar_phi_1", "bar_phi_2"}
+
+
+@BOTH_TARGETS
+def test_the_average_begins_as_a_copy_and_learns_from_no_loss(target: str) -> None:
+    agent = replace(CASE, config=replace(CONFIG, target=target)).agent()
+    weights = weights_of(agent)
+    for name in weights:
+        if name.startswith("bar_"):
+            assert torch.equal(weights[name], weights[name.removeprefix("bar_")])
+    agent.update(CASE.batch_of(0))
+    assert not any(p.requires_grad for p in agent.critic_target.parameters())
+    assert all(p.grad is None for p in agent.critic_target.parameters())
+
+
+def test_every_network_is_learnt_by_one_optimizer() -> None:
+    agent = CASE.agent()
+    groups = [
+        [p for group in optimizer.param_groups for p in group["params"]]
+        for optimizer in (agent.critic_optimizer, agent.actor_optimizer)
+    ]
+    learnt = [id(p) for group in groups for p in group]
+    assert sorted(learnt) == sorted(id(p) for p in agent.networks.parameters())
+    assert len(set(learnt)) == len(learnt)

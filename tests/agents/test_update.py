@@ -1,0 +1,278 @@
+"""The package's update against the reference's: the same state, sample and chance give the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import reference
+import torch
+from bridge import (
+    Case,
+    beyond,
+    double,
+    draws_of,
+    error,
+    errors,
+    gradients_of,
+    moments_of,
+    sample_of,
+    state_of,
+    warm,
+    weather,
+    weights_of,
+)
+from torch import Tensor
+
+from merl.agents.ddpg import DDPG
+from merl.agents.merl import MERLConfig
+
+SMALL = MERLConfig(latent_dim=48, conv_channels=8, hidden_dim=32, precision="fp32")
+TWO_CAMERAS = {"front": (24, 28, 3), "wrist": (26, 20, 1)}
+
+CASES = [
+    Case("final", SMALL),
+    Case("six-layers", replace(SMALL, head_layers=6)),
+    Case("averaged-fusion", replace(SMALL, target="heads_and_fusion")),
+    Case("mlp-proprioception", replace(SMALL, vector_encoder_dim=20)),
+    Case("strides-2211", replace(SMALL, conv_strides=(2, 2, 1, 1))),
+    Case("two-cameras", SMALL, images=TWO_CAMERAS),
+    Case("two-vectors", SMALL, vectors={"joints": 5, "touch": 2}),
+    Case("simplex", replace(SMALL, squash="simplex")),
+    Case(
+        "other-numbers",
+        replace(SMALL, tau=0.3, noise_std=0.5, noise_clip=0.4, shift_pad=2, learning_rate=3e-3),
+    ),
+    Case(
+        "all-at-once",
+        replace(SMALL, head_layers=6, target="heads_and_fusion", vector_encoder_dim=20),
+        images=TWO_CAMERAS,
+    ),
+]
+PAPER_3, PAPER_6 = (
+    Case(
+        f"paper-{layers}-layers",
+        MERLConfig(head_layers=layers, precision="fp32"),
+        images={"image": (84, 84, 3)},
+        vectors={"proprio": 24},
+        batch=16,
+    )
+    for layers in (3, 6)
+)
+
+
+def named_cases(*cases: Case) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
+
+
+def prepared(case: Case, dtype: torch.dtype) -> DDPG:
+    """An agent in mid-training: nothing in it is zero, one, or equal to something else."""
+    agent = case.agent()
+    if dtype == torch.float64:
+        double(agent)
+    weather(agent)
+    warm(agent)
+    return agent
+
+
+def learn(agent: DDPG, case: Case, seed: int, dtype: torch.dtype) -> dict[str, Tensor]:
+    draws = draws_of(case.chance_of(seed), case.config, dtype)
+    return agent.learn(case.batch_of(seed, dtype), draws)
+
+
+def expect(
+    state: reference.State, case: Case, seed: int
+) -> tuple[reference.State, reference.Report]:
+    return reference.update(state, sample_of(case.batch_of(seed)), case.chance_of(seed), case.spec)
+
+
+def check_in_double_precision(case: Case, updates: int) -> None:
+    agent = prepared(case, torch.float64)
+    state = state_of(agent)
+    for seed in range(updates):
+        metrics = learn(agent, case, seed, torch.float64)
+        state, report = expect(state, case, seed)
+        assert error(metrics["critic_loss"], report.critic_loss) < 1e-8
+        assert error(metrics["actor_loss"], report.actor_loss) < 1e-8
+        assert error(metrics["target_q"], report.y.mean()) < 1e-8
+        assert not beyond(errors(gradients_of(agent), report.gradients), 1e-8)
+    assert not beyond(errors(weights_of(agent), state.weights), 1e-9)
+    for optimizer, truth in (
+        (agent.critic_optimizer, state.critic_adam),
+        (agent.actor_optimizer, state.actor_adam),
+    ):
+        moments = moments_of(optimizer, agent)
+        assert moments.t == truth.t
+        assert not beyond(errors(moments.m, truth.m), 1e-8)
+        assert not beyond(errors(moments.v, truth.v), 1e-8)
+
+
+@named_cases(*CASES)
+def test_losses_gradients_and_weights_of_five_updates(case: Case) -> None:
+    check_in_double_precision(case, updates=5)
+
+
+def test_the_papers_size() -> None:
+    check_in_double_precision(PAPER_3, updates=1)
+
+
+@pytest.mark.long
+@named_cases(PAPER_3, PAPER_6)
+def test_five_updates_at_the_papers_size(case: Case) -> None:
+    check_in_double_precision(replace(case, batch=32), updates=5)
+
+
+def test_the_first_update_of_a_fresh_agent() -> None:
+    """Adam's bias correction is largest at its first step."""
+    case = CASES[0]
+    agent = double(case.agent())
+    state = state_of(agent)
+    for seed in range(2):
+        learn(agent, case, seed, torch.float64)
+        state, _ = expect(state, case, seed)
+    assert not beyond(errors(weights_of(agent), state.weights), 1e-9)
+
+
+@named_cases(*CASES)
+def test_single_precision(case: Case) -> None:
+    check_single_precision(case)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [PAPER_3, pytest.param(PAPER_6, marks=pytest.mark.long)],
+    ids=lambda case: case.name,
+)
+def test_single_precision_at_the_papers_size(case: Case) -> None:
+    check_single_precision(case)
+
+
+def check_single_precision(case: Case) -> None:
+    agent = prepared(case, torch.float32)
+    state = state_of(agent)
+    metrics = learn(agent, case, 0, torch.float32)
+    _, report = expect(state, case, 0)
+    assert error(metrics["critic_loss"], report.critic_loss) < 1e-4
+    assert error(metrics["actor_loss"], report.actor_loss) < 1e-4
+    assert not beyond(errors(gradients_of(agent), report.gradients), 1e-4)
+
+
+@named_cases(*CASES)
+def test_bf16(case: Case) -> None:
+    """Losses to 1 %; every network's gradient points where the true one does, cosine above 0.9.
+
+    A sharper bound would bind the rounding: the actor's gradient is a small difference of large
+    terms, and bf16 has eight binary digits.
+    """
+    case = replace(case, config=replace(case.config, precision="bf16"), batch=64)
+    agent = prepared(case, torch.float32)
+    state = state_of(agent)
+    metrics = learn(agent, case, 0, torch.float32)
+    _, report = expect(state, case, 0)
+    for name, truth in (("critic_loss", report.critic_loss), ("actor_loss", report.actor_loss)):
+        assert (metrics[name] - truth).abs() < 0.01 * (1 + truth.abs())
+    found = gradients_of(agent)
+    for symbol in (*reference.CRITIC_LEARNS, *reference.ACTOR_LEARNS):
+        names = reference.of(found, [symbol])  # none for the identity's zeta
+        if names:
+            g, truth = (
+                torch.cat([of[n].flatten() for n in names]) for of in (found, report.gradients)
+            )
+            assert torch.cosine_similarity(g, truth, dim=0) > 0.9, symbol
+            assert 0.7 < g.norm() / truth.norm() < 1.4, symbol
+
+
+# -- the comparison would see a misreading -------------------------------------------------------
+
+
+def apart_after(case: Case, spec: reference.Spec, updates: int = 1) -> float:
+    """The largest difference in a gradient or a weight when the reference follows `spec`."""
+    agent = prepared(case, torch.float64)
+    state = state_of(agent)
+    for seed in range(updates):
+        learn(agent, case, seed, torch.float64)
+        state, report = reference.update(
+            state, sample_of(case.batch_of(seed)), case.chance_of(seed), spec
+        )
+    found = errors(gradients_of(agent), report.gradients) | errors(weights_of(agent), state.weights)
+    return max(found.values())
+
+
+def test_actions_lie_at_the_clamp_and_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
+    case, beyond_the_clamp = CASES[0], []
+
+    def plain_clamp(a: Tensor) -> Tensor:
+        beyond_the_clamp.append(float((a.abs() > 1).double().mean()))
+        return a.clamp(-1, 1)
+
+    assert apart_after(case, case.spec) < 1e-8
+    monkeypatch.setattr(reference, "clamp_straight_through", plain_clamp)
+    assert apart_after(case, case.spec) > 1e-4
+    assert all(0.02 < share < 0.5 for share in beyond_the_clamp)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"averaged": ("phi_1", "phi_2")},  # of an agent that averages the fusion too
+        {"clip": 10.0},
+        {"sigma": 0.19},
+        {"tau": 0.0101},
+        {"squash": "simplex"},
+        {"learning_rate": 1.01e-4},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_another_number_is_seen(change: dict[str, object]) -> None:
+    case = next(case for case in CASES if case.name == "averaged-fusion")
+    assert apart_after(case, case.spec) < 1e-8
+    assert apart_after(case, replace(case.spec, **change)) > 1e-8
+
+
+# -- chance --------------------------------------------------------------------------------------
+
+
+def test_update_is_learn_with_its_own_draws() -> None:
+    case, agent, twin = CASES[0], CASES[0].agent(), CASES[0].agent()
+    for seed in range(2):
+        batch = case.batch_of(seed)
+        found, expected = agent.update(batch), twin.learn(batch, twin.draw(batch))
+        assert found.keys() == expected.keys()
+        assert all(torch.equal(found[name], expected[name]) for name in found)
+    assert all(map(torch.equal, weights_of(agent).values(), weights_of(twin).values()))
+
+
+def test_draws_are_clipped_noise_and_whole_shifts() -> None:
+    """A clipped normal: 13.4 % of it lies on the bounds, 1.5 sigma out; inside, sigma is 0.2."""
+    case = replace(CASES[5], batch=4000)
+    batch = replace(CASES[5], batch=1).batch_of(0)
+    batch = replace(batch, action=torch.zeros(case.batch, 6))
+    draws = case.agent().draw(batch)
+    for noise in (draws.next_noise, draws.actor_noise):
+        assert noise.shape == batch.action.shape
+        assert noise.abs().max() == pytest.approx(0.3)
+        assert (noise.abs() >= 0.3 - 1e-6).float().mean() == pytest.approx(0.1336, abs=0.01)
+        assert noise.std() == pytest.approx(0.1764, abs=0.003)
+    for shifts in (draws.shifts, draws.next_shifts):
+        assert shifts.keys() == case.images.keys()
+        assert all(s.shape == (case.batch, 2) for s in shifts.values())
+    independent = [draws.next_noise, draws.actor_noise]
+    independent += [s[k] for s in (draws.shifts, draws.next_shifts) for k in s]
+    for i, x in enumerate(independent):
+        for y in independent[:i]:
+            columns = torch.stack([x[:, 0].double(), y[:, 0].double()])
+            assert torch.corrcoef(columns)[0, 1].abs() < 0.08
+
+
+def test_no_shift_is_drawn_where_there_is_none() -> None:
+    case = replace(CASES[0], config=replace(SMALL, shift_pad=0))
+    assert case.agent().draw(case.batch_of(0)).shifts == {}
+    agent = double(case.agent())
+    state = state_of(agent)
+    batch = case.batch_of(0, torch.float64)
+    chance = case.chance_of(0)
+    agent.learn(
+        batch, replace(draws_of(chance, case.config, torch.float64), shifts={}, next_shifts={})
+    )
+    _, report = reference.update(state, sample_of(batch), chance, case.spec)
+    assert not beyond(errors(gradients_of(agent), report.gradients), 1e-8)

@@ -1,0 +1,155 @@
+"""Random shift against its definition and against DrQ-v2's way to write it; the network's input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from merl.networks.augmentation import (
+    _shift_by_index,
+    _shift_by_slices,
+    draw_shifts,
+    shift,
+    to_input,
+)
+
+SHAPES = [(1, 3, 84, 84, 3), (5, 2, 9, 12, 1), (3, 1, 4, 3, 3)]  # (B, K, H, W, C)
+
+
+def by_slices(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
+    return torch.from_numpy(_shift_by_slices(images.numpy(), shifts.numpy(), pad))
+
+
+both_paths = pytest.mark.parametrize("path", [by_slices, _shift_by_index, shift])
+
+
+def pictures(shape: tuple[int, ...], seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
+
+
+def padded_crop(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
+    """MERL 4.1, pixel by pixel: what lies outside the image is its nearest edge."""
+    height, width = images.shape[2:4]
+    shifted = torch.empty_like(images)
+    for b, (top, left) in enumerate(shifts.tolist()):
+        for i in range(height):
+            for j in range(width):
+                row = min(max(i + top - pad, 0), height - 1)
+                column = min(max(j + left - pad, 0), width - 1)
+                shifted[b, :, i, j] = images[b, :, row, column]
+    return shifted
+
+
+def grid_sampled(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
+    """DrQ-v2: replicate-pad, then sample bilinearly on a grid moved by whole pixels, in float32."""
+    batch, stack, side, _, channels = images.shape
+    flat = images.permute(0, 1, 4, 2, 3).reshape(batch, stack * channels, side, side).float()
+    padded = functional.pad(flat, (pad, pad, pad, pad), mode="replicate")
+    pixel = 2.0 / (side + 2 * pad)  # the padded image spans [-1, 1]
+    centres = torch.linspace(-1 + pixel / 2, 1 - pixel / 2, side + 2 * pad)[:side]
+    x = centres.expand(batch, side, side) + shifts[:, 1, None, None] * pixel
+    y = centres[:, None].expand(batch, side, side) + shifts[:, 0, None, None] * pixel
+    sampled = functional.grid_sample(padded, torch.stack([x, y], -1), align_corners=False)
+    return sampled.reshape(batch, stack, channels, side, side).permute(0, 1, 3, 4, 2)
+
+
+@both_paths
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("pad", [1, 4])
+def test_the_padded_crop(path, shape: tuple[int, ...], pad: int) -> None:
+    images = pictures(shape)
+    shifts = draw_shifts(shape[0], pad, torch.Generator().manual_seed(1))
+    shifted = path(images, shifts, pad)
+    assert shifted.dtype == torch.uint8
+    assert torch.equal(shifted, padded_crop(images, shifts, pad))
+
+
+@both_paths
+def test_drqv2s_grid_sample(path) -> None:
+    images = pictures((81, 3, 84, 84, 1))
+    shifts = torch.cartesian_prod(torch.arange(9), torch.arange(9))  # every one there is
+    apart = (path(images, shifts, 4).float() - grid_sampled(images, shifts, 4)).abs()
+    assert apart.max() < 0.01  # of 255: float32's rounding of the grid
+
+
+@both_paths
+def test_the_extremes(path) -> None:
+    image = torch.arange(30, dtype=torch.uint8).reshape(1, 1, 5, 6, 1)
+    far = path(image, torch.tensor([[0, 0]]), 4)[0, 0, ..., 0]
+    assert torch.equal(far[:4, :4], torch.zeros(4, 4, dtype=torch.uint8))
+    assert far[4, 4:].tolist() == [0, 1]
+    other = path(image, torch.tensor([[8, 8]]), 4)[0, 0, ..., 0]
+    assert other[0, :3].tolist() == [28, 29, 29]
+    assert (other[1:] == other[0]).all()
+    assert torch.equal(path(image, torch.tensor([[4, 4]]), 4), image)
+    down = path(image, torch.tensor([[5, 4]]), 4)[0, 0, ..., 0]  # rows come first
+    assert down[0].tolist() == [6, 7, 8, 9, 10, 11]
+
+
+@both_paths
+def test_a_stack_moves_as_one_and_samples_on_their_own(path) -> None:
+    images = pictures((2, 1, 12, 12, 3)).expand(2, 3, 12, 12, 3)
+    shifted = path(images, torch.tensor([[1, 7], [6, 2]]), 4)
+    assert torch.equal(shifted[:, 0], shifted[:, 1])
+    assert torch.equal(shifted[:, 0], shifted[:, 2])
+    assert torch.equal(shifted[0, 0, 3:-3, 0:-3], images[0, 0, 0:-6, 3:])
+    assert torch.equal(shifted[1, 0, 0:-2, 2:], images[1, 0, 2:, 0:-2])
+
+
+def test_the_original_is_left_alone() -> None:
+    images = pictures((2, 3, 8, 8, 3))
+    before = images.clone()
+    shift(images, torch.tensor([[0, 0], [4, 4]]), 4).fill_(7)
+    assert torch.equal(images, before)
+
+
+@pytest.mark.parametrize("pad", [1, 4])
+def test_shifts_are_uniform(pad: int) -> None:
+    size, places = 90_000, 2 * pad + 1
+    shifts = draw_shifts(size, pad, torch.Generator().manual_seed(0))
+    assert shifts.dtype == torch.int64
+    assert shifts.shape == (size, 2)
+    cells = torch.bincount(shifts[:, 0] * places + shifts[:, 1], minlength=places**2)
+    assert len(cells) == places**2
+    expected = size / places**2
+    chi_squared = float(((cells - expected) ** 2 / expected).sum())
+    freedom = places**2 - 1
+    assert chi_squared < freedom + 5 * np.sqrt(2 * freedom)
+
+
+def test_shifts_follow_the_generator() -> None:
+    first, again, other = (
+        draw_shifts(50, 4, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1)
+    )
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_input(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    images = pictures(shape)
+    batch, stack, height, width, channels = shape
+    x = to_input(images, dtype)
+    assert x.dtype == dtype
+    assert x.shape == (batch, stack * channels, height, width)
+    for frame in range(stack):  # the oldest first, its channels together
+        for channel in range(channels):
+            expected = images[:, frame, :, :, channel].to(torch.float64) / 255 - 0.5
+            found = x[:, frame * channels + channel].to(torch.float64)
+            torch.testing.assert_close(found, expected, rtol=0, atol=1e-7)
+
+
+def test_the_input_spans_half_to_each_side() -> None:
+    images = torch.tensor([0, 255], dtype=torch.uint8).reshape(2, 1, 1, 1, 1)
+    x = to_input(images, torch.float64)
+    torch.testing.assert_close(x.flatten(), torch.tensor([-0.5, 0.5], dtype=torch.float64))
+
+
+def test_the_input_lies_channels_last() -> None:
+    x = to_input(pictures((2, 3, 8, 9, 3)), torch.float32)
+    assert x.is_contiguous(memory_format=torch.channels_last)

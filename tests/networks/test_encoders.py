@@ -1,0 +1,88 @@
+"""Encoders: their lengths, the order of the flat features, what they refuse."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from merl.core import MerlError
+from merl.networks.encoders import ConvEncoder, IdentityEncoder, MLPEncoder
+from merl.networks.representation import Encoders
+
+
+def test_the_papers_encoder() -> None:
+    encoder = ConvEncoder(9, (84, 84))
+    convolutions = [m for m in encoder.modules() if isinstance(m, torch.nn.Conv2d)]
+    assert [c.stride[0] for c in convolutions] == [2, 1, 1, 1]
+    assert all(c.kernel_size == (3, 3) and c.out_channels == 32 for c in convolutions)
+    assert encoder.features == 32 * 35 * 35 == 39_200
+
+
+@pytest.mark.parametrize("size", [(24, 28), (48, 48), (17, 31)])
+@pytest.mark.parametrize("strides", [(2, 1, 1, 1), (2, 2, 1), (1,), (3, 2)])
+def test_features_are_as_many_as_said(size: tuple[int, int], strides: tuple[int, ...]) -> None:
+    encoder = ConvEncoder(6, size, channels=4, strides=strides)
+    assert encoder(torch.randn(2, 6, *size)).shape == (2, encoder.features)
+
+
+def test_features_go_by_rows_columns_channels() -> None:
+    encoder = ConvEncoder(3, (9, 11), channels=4, strides=(2,))
+    images = torch.randn(2, 3, 9, 11)
+    maps = encoder.convolutions(images)  # (2, 4, 4, 5)
+    features = encoder(images)
+    for row, column, channel in [(0, 0, 0), (1, 3, 2), (3, 4, 3)]:
+        flat = (row * 5 + column) * 4 + channel
+        assert torch.equal(features[:, flat], maps[:, channel, row, column])
+    assert features.min() >= 0  # a ReLU is the last thing
+
+
+@pytest.mark.parametrize(
+    ("size", "strides", "fits"),
+    [
+        ((17, 17), (2, 1, 1, 1), True),
+        ((15, 15), (2, 1, 1, 1), True),
+        ((14, 15), (2, 1, 1, 1), False),
+        ((15, 14), (2, 1, 1, 1), False),
+        ((2, 2), (2, 2, 2, 2), False),
+        ((1, 1), (4, 4), False),
+    ],
+)
+def test_an_image_too_small_is_refused(
+    size: tuple[int, int], strides: tuple[int, ...], fits: bool
+) -> None:
+    if fits:
+        assert ConvEncoder(3, size, strides=strides).features == 32 * (1 if size[0] < 17 else 4)
+    else:
+        with pytest.raises(MerlError, match=f"{size[0]}x{size[1]} pixels is too small"):
+            ConvEncoder(3, size, strides=strides)
+
+
+def test_the_identity() -> None:
+    encoder = IdentityEncoder(7)
+    vector = torch.randn(3, 7)
+    assert encoder(vector) is vector
+    assert encoder.features == 7
+    assert not list(encoder.parameters())
+
+
+def test_the_mlp_has_two_layers_and_ends_in_a_relu() -> None:
+    encoder = MLPEncoder(7, 16)
+    assert encoder.features == 16
+    assert sum(isinstance(m, torch.nn.Linear) for m in encoder.modules()) == 2
+    out = encoder(torch.randn(50, 7))
+    assert out.shape == (50, 16)
+    assert out.min() == 0
+
+
+def test_each_modality_is_encoded_images_first() -> None:
+    cameras = {key: ConvEncoder(3, (9, 9), channels=2, strides=(2,)) for key in ("front", "wrist")}
+    encoders = Encoders(cameras, {"proprio": IdentityEncoder(5)}, pad=4)
+    stack = torch.randint(0, 256, (2, 3, 9, 9, 1), dtype=torch.uint8)
+    observation = {"proprio": torch.randn(2, 5), "wrist": stack, "front": 255 - stack}
+    encoded = encoders(observation)
+    assert list(encoded) == list(encoders.features) == ["front", "wrist", "proprio"]
+    assert {key: x.shape[1] for key, x in encoded.items()} == encoders.features
+    middle = torch.full((2, 2), 4)
+    shifted = encoders(observation, {"front": middle, "wrist": middle - 2})
+    assert torch.equal(shifted["front"], encoded["front"])
+    assert not torch.equal(shifted["wrist"], encoded["wrist"])

@@ -94,17 +94,12 @@ def test_a_fresh_agent_can_be_saved() -> None:
     check_it_goes_on(through_a_file(agent.state_dict()), agent)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="a loaded moment keeps the memory order that it was saved in, not its parameter's",
-)
 def test_the_memory_order_of_a_saved_tensor_does_not_matter() -> None:
     """A fused Adam walks weights and moments side by side in memory, whatever their strides say."""
     agent = trained(CASE.agent(), range(5))
     check_it_goes_on(contiguous(through_a_file(agent.state_dict())), agent)
 
 
-@pytest.mark.xfail(strict=True, reason="Adam takes the moments that it is given without a copy")
 def test_a_loaded_agent_shares_nothing_with_the_other() -> None:
     agent = trained(CASE.agent(), range(2))
     twin = CASE.agent(seed=99)

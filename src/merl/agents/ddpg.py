@@ -8,11 +8,13 @@ Algorithm 1: `update_critic`, `update_actor`, `update_target`.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -44,8 +46,11 @@ class DDPGConfig:
     which times both once."""
 
     def __post_init__(self) -> None:
-        if not self.learning_rate > 0:
+        if not 0 < self.learning_rate < math.inf:
             raise MerlError(f"agent.learning-rate must be above 0, not {self.learning_rate}")
+        if self.precision not in get_args(Precision):
+            choices = ", ".join(get_args(Precision))
+            raise MerlError(f"agent.precision {self.precision!r} is unknown: choose from {choices}")
         if not 0 < self.tau <= 1:
             raise MerlError(f"agent.tau must lie in (0, 1], not {self.tau}")
         if not self.noise_std >= 0:
@@ -124,8 +129,10 @@ class DDPG:
         self.actor_parameters = [*networks.actor_fusion.parameters(), *networks.actor.parameters()]
         self.critic_optimizer = self._adam(self.critic_parameters)
         self.actor_optimizer = self._adam(self.actor_parameters)
-        self.acting = torch.Generator(device).manual_seed(seed)
-        self.learning = torch.Generator(device).manual_seed(seed + 1)
+        words = np.random.SeedSequence(seed).generate_state(2)
+        self.acting, self.learning = (
+            torch.Generator(device).manual_seed(int(word)) for word in words
+        )
 
     # Acting ---------------------------------------------------------------------------------
 
@@ -250,8 +257,8 @@ class DDPG:
         """Take back what `state_dict` gave."""
         self.networks.load_state_dict(state["networks"])
         self.critic_target.load_state_dict(state["critic_target"])
-        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
-        self.actor_optimizer.load_state_dict(state["actor_optimizer"])
+        _load(self.critic_optimizer, state["critic_optimizer"])
+        _load(self.actor_optimizer, state["actor_optimizer"])
         self.acting.set_state(state["acting"].cpu())
         self.learning.set_state(state["learning"].cpu())
 
@@ -284,6 +291,18 @@ def _step(optimizer: torch.optim.Optimizer, loss: Tensor, parameters: list[nn.Pa
     optimizer.zero_grad()
     torch.autograd.backward(loss, inputs=parameters)
     optimizer.step()
+
+
+def _load(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
+    """Take back Adam's moments, as copies in the memory order of the weights.
+
+    The fused step walks raw memory: moments in another order would meet the wrong weights.
+    """
+    optimizer.load_state_dict(dict(saved))
+    for parameter, moments in optimizer.state.items():
+        for name in ("exp_avg", "exp_avg_sq"):
+            moments[name] = torch.empty_like(parameter).copy_(moments[name])
+        moments["step"] = moments["step"].clone()
 
 
 def _clamp_straight_through(action: Tensor) -> Tensor:

@@ -65,8 +65,15 @@ class MERLConfig(DDPGConfig):
             if getattr(self, name) < 1:
                 flag = name.replace("_", "-")
                 raise MerlError(f"agent.{flag} must be at least 1, not {getattr(self, name)}")
-        if self.shift_pad < 0:
-            raise MerlError(f"agent.shift-pad must be at least 0, not {self.shift_pad}")
+        for name in ("shift_pad", "vector_encoder_dim"):
+            if getattr(self, name) < 0:
+                flag = name.replace("_", "-")
+                raise MerlError(f"agent.{flag} must be at least 0, not {getattr(self, name)}")
+        if not self.conv_strides or min(self.conv_strides) < 1:
+            raise MerlError(
+                f"agent.conv-strides {self.conv_strides} must name a stride of at least 1 for each "
+                "convolution"
+            )
 
 
 def modalities(config: MERLConfig, space: spaces.Dict) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -6,9 +6,12 @@ and ready to go on.
 
 from __future__ import annotations
 
+import logging
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
 import merl
 from merl.cli.parsing import meant
@@ -27,6 +30,9 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     args = list(sys.argv[1:] if arguments is None else arguments)
+    warnings.showwarning = _show_warning
+    logging.basicConfig(format="merl: %(levelname)s: %(message)s", level=logging.WARNING)
+    logging.addLevelName(logging.WARNING, "warning")
     try:
         if not args or args[0] in ("-h", "--help"):
             print(_usage())
@@ -44,6 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """A warning is for the user: one line, without the place in the source."""
+    print(f"merl: warning: {message}", file=sys.stderr)
 
 
 def _usage() -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +20,7 @@ def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
 
     def command(
-        run: Annotated[Path, tyro.conf.Positional],
+        run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
         episodes: int = 10,
         video: Path | None = None,
         checkpoint: str = "latest",
@@ -56,13 +55,6 @@ def _evaluate(
     console = Console()
     policy = load_policy(run, checkpoint=checkpoint)
     changes = {} if renderer is None else {"renderer": renderer}
-    trained_with = policy.config.env.renderer
-    if renderer not in (None, trained_with):
-        print(
-            f"merl: warning: the agent was trained with renderer {trained_with} and is shown "
-            f"{renderer}: the pictures differ, and it may do worse",
-            file=sys.stderr,
-        )
     env = policy.make_env(render_mode="rgb_array" if video else None, **changes)
     try:
         result = evaluate_policy(policy, env, episodes, reset=policy.reset, video=video)

@@ -74,9 +74,9 @@ def _expected(preset: str) -> str:
             timing = trainer.timing
     except MerlError as error:
         return str(error)
-    update = timing.update[timing.precision]
+    update = timing.update[timing.best]
     rate = 1.0 / (timing.step + config.updates_per_step * update)
     return (
         f"about {rate:.0f} steps/s and {rate * config.updates_per_step:.0f} updates/s "
-        f"({timing.precision}; {timing.seconds(config) / 3600:.1f} h for {config.steps:,} steps)"
+        f"({timing.best}; {timing.seconds(config) / 3600:.1f} h for {config.steps:,} steps)"
     )

@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -43,14 +44,16 @@ def parse(target: Callable[..., T], prog: str, args: list[str], **options: Any) 
 
 def _one_line(box: str) -> str:
     """The message of tyro's framed error, and the first flag that it thinks was meant."""
-    lines = [line.strip("│╭╰╮╯─ ") for line in box.splitlines()]
-    parts = [line for line in lines[1:] if line]
-    message = parts[0] if parts else box.strip()
+    lines = [line.strip("│╭╰╮╯ ") for line in box.splitlines()][1:]  # less the frame's title
+    first = takewhile(lambda line: not line.startswith("─"), lines)
+    message = " ".join(line for line in first if line)
+    if not message:
+        return " ".join(box.split())
     message = message[0].lower() + message[1:]
     if "erhaps you meant" in box:
-        flag = next((re.match(r"--[\w.-]+", line) for line in parts if line.startswith("--")), None)
-        if flag:
-            message += f": did you mean {flag.group()}?"
+        flags = [match for line in lines if (match := re.match(r"--[\w.-]+", line))]
+        if flags:
+            message += f": did you mean {flags[0].group()}?"
     return message
 
 

@@ -24,7 +24,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
     run, trained = outcome.run, outcome.evaluation
     if trained is None:
         return
-    chance = random_evaluation(run.config, run.config.eval.episodes)
+    chance = random_evaluation(run.config)
     console.print()
     console.print(_table(run.config, chance, trained))
     references = {"random": chance.returns.mean}
@@ -42,7 +42,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
     console.print(_way_on(outcome), highlight=False, soft_wrap=True)
 
 
-def random_evaluation(config: TrainConfig, episodes: int) -> Evaluation:
+def random_evaluation(config: TrainConfig, episodes: int = 20) -> Evaluation:
     """Uniformly random actions from the evaluation's starts; nothing is rendered for them."""
     env = make_run_env(config, observations=("proprio",))
     shape = env.action_space.shape
@@ -69,7 +69,9 @@ def _table(config: TrainConfig, chance: Evaluation, trained: Evaluation) -> Tabl
     if config.task in BEST_KNOWN:
         whose, value = BEST_KNOWN[config.task]
         table.add_row("best known", f"{value:.1f}", "", "")
-        table.caption = f"{len(trained.episodes)} episodes, 95 % intervals; best known: {whose}"
+        table.caption = (
+            f"trained: {len(trained.episodes)} episodes; 95 % intervals; best known: {whose}"
+        )
     return table
 
 

@@ -16,6 +16,7 @@ from merl.cli.summary import summarize
 from merl.core import MerlError
 from merl.experiments.presets import ABOUT, PRESETS
 from merl.replay import replay_bytes
+from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
 from merl.training.console import ConsoleView
 from merl.training.run import Run
@@ -33,7 +34,7 @@ def resume(args: list[str]) -> int:
     """Go on with a run: merl resume RUN [--steps N] [--minutes N]."""
 
     def command(
-        run: Annotated[Path, tyro.conf.Positional],
+        run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
         steps: int | None = None,
         minutes: float | None = None,
     ) -> tuple[Path, dict[str, Any]]:
@@ -50,15 +51,21 @@ def resume(args: list[str]) -> int:
     folder, changes = parse(command, "merl resume", args)
     run = Run.open(folder)
     config = dataclasses.replace(run.config, **changes)
-    return _train(config, f"run {folder} goes on", resumed=Run(run.path, config))
+    step = Checkpoint.find(run.checkpoints).step
+    if step >= config.steps:
+        print(f"{folder} is done: {step:,} of {config.steps:,} steps; --steps N takes it further")
+        return 0
+    return _train(
+        config, f"run {folder} goes on at step {step:,}", resumed=Run(run.path, config), done=step
+    )
 
 
-def _train(config: TrainConfig, what: str, resumed: Run | None = None) -> int:
+def _train(config: TrainConfig, what: str, resumed: Run | None = None, done: int = 0) -> int:
     console = Console()
     with Trainer.prepare(config) as trainer:
         if resumed is None:
             trainer.check()
-        console.print(_outlook(trainer, what), highlight=False)
+        console.print(_outlook(trainer, what, done), highlight=False, soft_wrap=True)
         with ConsoleView(console) as view:
             outcome = trainer.resume(resumed, view) if resumed else trainer.start(view)
     folder = outcome.run.path
@@ -70,21 +77,21 @@ def _train(config: TrainConfig, what: str, resumed: Run | None = None) -> int:
     return 0
 
 
-def _outlook(trainer: Trainer, what: str) -> str:
+def _outlook(trainer: Trainer, what: str, done: int) -> str:
     """What is going to happen, and how long it will take on this machine."""
     config, timing = trainer.config, trainer.timing
-    seconds = timing.seconds(config)
+    seconds = timing.seconds(config, done)
     size = replay_bytes(config.replay, trainer.space, trainer.action_space, config.capacity)
-    tried = ", ".join(f"{name} {1000 * s:.0f} ms" for name, s in timing.update.items())
+    tried = ", ".join(f"{1000 * s:.0f} ms in {how}" for how, s in timing.update.items())
     lines = [
-        f"{what}: {config.steps:,} steps of {config.task} on {config.device} take about "
+        f"{what}: {config.steps - done:,} steps of {config.task} on {config.device} take about "
         f"{timedelta(seconds=round(seconds))}",
     ]
     if seconds > 86_400 and config.preset != "laptop":
         lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
     lines += [
-        f"an update takes {tried}: {timing.precision} it is; a step takes {1000 * timing.step:.1f} "
-        f"ms ({config.env.renderer} pictures)",
+        f"an update takes {tried}; a step takes {1000 * timing.step:.1f} ms "
+        f"({config.env.renderer} pictures)",
         f"the replay takes {size / 1e9:.2f} GB for {config.capacity:,} steps",
     ]
     return "\n".join(lines)

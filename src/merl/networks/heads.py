@@ -21,6 +21,14 @@ class _Hidden(nn.Module):
         return torch.relu(self.norm(self.linear(x).to(self.linear.weight.dtype)))
 
 
+class _Output(nn.Linear):
+    """The last linear layer, always in the precision of the weights: bf16 would round Q away."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.to(self.weight.dtype))
+
+
 @dataclass(frozen=True)
 class HeadSize:
     """The shape of actor and critic.
@@ -40,7 +48,7 @@ def mlp(in_features: int, out_features: int, size: HeadSize) -> nn.Sequential:
     """An MLP of that shape; ReLU after each layer but the last."""
     widths = [in_features] + [size.width] * (size.layers - 1)
     hidden = [_Hidden(a, b, size.layer_norm) for a, b in pairwise(widths)]
-    return nn.Sequential(*hidden, nn.Linear(widths[-1], out_features))
+    return nn.Sequential(*hidden, _Output(widths[-1], out_features))
 
 
 class Actor(nn.Module):
@@ -52,8 +60,7 @@ class Actor(nn.Module):
 
     def forward(self, latent: Tensor) -> Tensor:
         """(B, d) to (B, A), in (-1, 1)."""
-        raw = self.layers(latent)
-        return torch.tanh(raw.to(self.layers[-1].weight.dtype))
+        return torch.tanh(self.layers(latent))
 
 
 class TwinCritic(nn.Module):
@@ -66,5 +73,4 @@ class TwinCritic(nn.Module):
     def forward(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Latent (B, d) and action (B, A) to the two values, (B,) each."""
         both = torch.cat([latent, action], dim=-1)
-        dtype = self.q1[-1].weight.dtype
-        return self.q1(both).squeeze(-1).to(dtype), self.q2(both).squeeze(-1).to(dtype)
+        return self.q1(both).squeeze(-1), self.q2(both).squeeze(-1)

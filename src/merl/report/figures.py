@@ -258,7 +258,7 @@ def _draw_references(axes: Axes, references: Reference, rate: bool = False) -> l
     for value in references.values():
         axes.axhline(value, color=MUTED, lw=1.0, ls=(0, (4, 3)), zorder=1.2)
     return [
-        _Label(f"{label} {100 * value:.3g} %" if rate else f"{label} {value:.3g}", value, MUTED)
+        _Label(f"{label} {100 * value:.0f} %" if rate else f"{label} {value:.1f}", value, MUTED)
         for label, value in references.items()
     ]
 

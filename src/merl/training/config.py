@@ -35,7 +35,7 @@ class EvaluationConfig:
 class TrainConfig:
     """A training run; the values are Table 1's."""
 
-    task: Annotated[str, tyro.conf.Positional]
+    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """What is to be learnt, e.g. reach_duplo."""
     preset: str = "paper"
     """Which set of values the others were taken from."""
@@ -46,11 +46,12 @@ class TrainConfig:
     minutes: float | None = None
     """Stop after this many minutes of training, if the steps are not done before."""
     run_dir: Path | None = None
-    """The run's folder; runs/TASK-PRESET-sSEED if not set. It must not exist yet."""
+    """The run's folder, which must not exist yet; runs/TASK-PRESET-sSEED (or -2, -3, ...) if not
+    set."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the networks live; auto takes CUDA where it is there."""
     threads: int | None = None
-    """Processor threads of the update; as many as there are cores if not set."""
+    """Processor threads of the update; if not set, one or all, whichever is faster here."""
     random_steps: int = 2000
     """Steps of uniformly random actions at the start ("exploration steps" in Table 1)."""
     seed_steps: int = 4000

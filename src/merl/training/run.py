@@ -12,6 +12,7 @@ curve.png       the learning curve, drawn when training ends
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import platform
@@ -116,8 +117,12 @@ class Run:
 
 
 def run_path(config: TrainConfig) -> Path:
-    """The folder that a config names, or the default one."""
-    return config.run_dir or Path("runs") / f"{config.task}-{config.preset}-s{config.seed}"
+    """The folder that a config names, or the first of the default ones that is free."""
+    if config.run_dir is not None:
+        return config.run_dir
+    name = f"{config.task}-{config.preset}-s{config.seed}"
+    numbered = (Path("runs") / f"{name}-{number}" for number in itertools.count(2))
+    return next(p for p in itertools.chain([Path("runs") / name], numbered) if not p.exists())
 
 
 def refuse_existing(path: Path) -> None:

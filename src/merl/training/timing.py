@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,38 +23,73 @@ MEASURED_STEPS = 25
 
 
 @dataclass(frozen=True)
+class Arithmetic:
+    """How updates are computed."""
+
+    precision: Literal["fp32", "bf16"]
+    threads: int
+
+    def __str__(self) -> str:
+        return f"{self.precision} on {self.threads} thread{'s' * (self.threads > 1)}"
+
+
+@dataclass(frozen=True)
 class Timing:
     """Seconds, as measured.
 
     Attributes:
-        update: of one update, for each precision that was tried.
+        update: of one update, for each way that was tried.
         step: of one environment step, picture included.
-        precision: the fastest, or the one that the config asks for.
     """
 
-    update: Mapping[Literal["fp32", "bf16"], float]
+    update: Mapping[Arithmetic, float]
     step: float
-    precision: Literal["fp32", "bf16"]
 
-    def seconds(self, config: TrainConfig) -> float:
-        """The time that a run will take, evaluation included."""
-        updates = max(0, config.steps - config.seed_steps) * config.updates_per_step
-        evaluations = max(1, config.steps // config.eval.every) * config.eval.episodes
+    @property
+    def best(self) -> Arithmetic:
+        """The fastest way to compute updates."""
+        return min(self.update, key=lambda arithmetic: self.update[arithmetic])
+
+    def seconds(self, config: TrainConfig, done: int = 0) -> float:
+        """The time that a run will take from step `done` on, evaluation included."""
+        steps = config.steps - done
+        updates = (config.steps - max(done, config.seed_steps)) * config.updates_per_step
+        evaluations = max(1, steps // config.eval.every) * config.eval.episodes
         length = 250  # steps of an episode, near enough for an estimate
-        whole = updates * self.update[self.precision]
-        whole += (config.steps + evaluations * length) * self.step
+        whole = max(0.0, updates) * self.update[self.best]
+        whole += (steps + evaluations * length) * self.step
         return min(whole, (config.minutes or float("inf")) * 60)
 
 
 def measure(config: TrainConfig, env: gymnasium.Env[Any, Any], device: torch.device) -> Timing:
-    """Time the update in fp32 and bf16 (or as the config says), and the environment's step."""
-    asked = config.agent.precision
+    """Time the environment's step, and the update in every way that the config leaves open.
+
+    Precision first, on one thread; then the fastest on all threads. More threads are not always
+    faster: on a machine that others use too, each waits for the slowest.
+    """
+    asked, cores = config.agent.precision, len(os.sched_getaffinity(0))
+    threads = config.threads or (cores if device.type == "cuda" else 1)
     precisions: tuple[Literal["fp32", "bf16"], ...] = (
         ("fp32", "bf16") if asked == "auto" else (asked,)
     )
-    update = {p: _time_update(config, env, device, p) for p in precisions}
-    fastest = min(precisions, key=lambda p: update[p])
-    return Timing(update, _time_step(env), fastest)
+    update: dict[Arithmetic, float] = {}
+    for precision in precisions:
+        _try(Arithmetic(precision, threads), update, config, env, device)
+    fastest = min(update, key=lambda arithmetic: update[arithmetic])
+    if config.threads is None and cores > threads:
+        _try(Arithmetic(fastest.precision, cores), update, config, env, device)
+    return Timing(update, _time_step(env))
+
+
+def _try(
+    arithmetic: Arithmetic,
+    update: dict[Arithmetic, float],
+    config: TrainConfig,
+    env: gymnasium.Env[Any, Any],
+    device: torch.device,
+) -> None:
+    torch.set_num_threads(arithmetic.threads)
+    update[arithmetic] = _time_update(config, env, device, arithmetic.precision)
 
 
 def _time_update(
@@ -76,7 +112,7 @@ def _time_update(
     def update() -> None:
         float(agent.update(batch)["critic_loss"])  # reading it waits for the device
 
-    update()
+    update()  # the first one also sets up what the others use
     return _median_seconds(update)
 
 

@@ -156,10 +156,13 @@ class Trainer:
     ) -> None:
         self.env, self.device = env, device
         self.timing = measure(config, env, device)
+        best = self.timing.best
+        torch.set_num_threads(best.threads)
         self.config = dataclasses.replace(
             config,
+            threads=best.threads,
             device="cuda" if device.type == "cuda" else "cpu",
-            agent=dataclasses.replace(config.agent, precision=self.timing.precision),
+            agent=dataclasses.replace(config.agent, precision=best.precision),
         )
         self.space, self.action_space = _spaces(self.config, env)
         self.progress, self.randomness = Progress(), Randomness(config.seed)
@@ -181,7 +184,6 @@ class Trainer:
             MerlError: a device, renderer, space or size that is not to be had here.
         """
         device = choose_device(config.device)
-        torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
         env = make_run_env(config)
         try:
             yield cls(config, env, device)

@@ -1,0 +1,294 @@
+"""The command line end to end, in the `smoke` preset, as a newcomer would use it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+
+import merl
+from merl.cli import main
+from merl.training.evaluation import EVALUATION_SEED
+
+MERL = [sys.executable, "-m", "merl.cli"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole `smoke` run, trained once."""
+    folder = tmp_path_factory.mktemp("runs") / "a run, größer"
+    command = [*MERL, "train", "reach_duplo", "--preset", "smoke", "--run-dir", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("preset smoke (as asked for")
+    for said in ("take about", "GB for 1,000 steps", "random actions", "best known", "too early"):
+        assert said in done.stdout
+    assert "Traceback" not in done.stderr
+    return folder
+
+
+def rows(run: Path) -> list[dict[str, str]]:
+    with (run / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_leaves_what_the_docs_promise(run: Path) -> None:
+    record = json.loads((run / "config.json").read_text())
+    assert record["config"]["env"]["renderer"] == "warp"
+    assert record["config"]["agent"]["precision"] in ("fp32", "bf16")
+    assert record["versions"]["mujoco"] == "3.17.0"
+    assert (record["task"], record["preset"], record["seed"]) == ("reach_duplo", "smoke", 0)
+    assert (run / "curve.png").stat().st_size > 10_000
+    assert list((run / "tensorboard").iterdir())
+    assert [path.name for path in sorted((run / "checkpoints").iterdir())] == [
+        "00000500",
+        "00001000",
+    ]
+
+
+def test_metrics_have_a_row_for_every_episode_and_evaluation(run: Path) -> None:
+    table = rows(run)
+    assert [int(row["step"]) for row in table] == [250, 500, 750, 1000]
+    assert [row["eval/return"] != "" for row in table] == [False, True, False, True]
+    assert all(row["train/return"] != "" for row in table)
+    assert table[-1]["learn/critic_loss"] != ""
+    for name in ("eval/success_end", "eval/success_any", "eval/reward/reaching", "eval/return_low"):
+        assert table[-1][name] != ""
+
+
+def test_the_video_is_real(run: Path) -> None:
+    (path,) = (run / "videos").glob("*.mp4")
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        assert stream.codec_context.name == "h264"
+        assert stream.average_rate == 25
+    assert len(frames) == 250
+    assert min(frames[0].shape[:2]) >= 480
+    assert np.abs(frames[0].astype(int) - frames[-1].astype(int)).mean() > 0.5
+
+
+def test_evaluate_and_a_policy_driven_by_hand_agree_exactly(run: Path, tmp_path: Path) -> None:
+    output, film = tmp_path / "out.json", tmp_path / "film.mp4"
+    arguments = ["evaluate", str(run), "--episodes", "3", "--json", str(output)]
+    assert main([*arguments, "--video", str(film)]) == 0
+    assert film.stat().st_size > 10_000
+    told = json.loads(output.read_text())
+    assert told["step"] == 1000
+
+    policy = merl.load_policy(run)
+    env = merl.make_env("reach_duplo", renderer="warp", image_size=32)
+    for index, episode in enumerate(told["episodes"]):
+        assert episode["seed"] == EVALUATION_SEED + index
+        observation, _ = env.reset(seed=episode["seed"])
+        policy.reset()
+        total, over = 0.0, False
+        while not over:
+            observation, reward, terminated, truncated, _ = env.step(policy(observation))
+            total, over = total + float(reward), terminated or truncated
+        assert total == episode["return"]
+    env.close()
+
+
+def test_a_policy_says_what_it_misses(run: Path) -> None:
+    policy = merl.load_policy(run)
+    with pytest.raises(merl.core.MerlError, match="lacks 'proprio'"):
+        policy({"image": np.zeros((32, 32, 3), np.uint8)})
+    with pytest.raises(merl.core.MerlError, match=r"shape \(48, 48, 3\)"):
+        policy({"image": np.zeros((48, 48, 3), np.uint8), "proprio": np.zeros(24, np.float32)})
+
+
+def test_evaluating_with_the_other_renderer_warns(run: Path) -> None:
+    policy = merl.load_policy(run)
+    with pytest.warns(UserWarning, match="trained with renderer 'warp'"), _closing_gl():
+        policy.make_env(renderer="gl", observations=("proprio",)).close()
+
+
+def _closing_gl():  # type: ignore[no-untyped-def]
+    """Without an OpenGL library the environment is refused after the warning, which is enough."""
+    import contextlib
+
+    return contextlib.suppress(merl.core.MerlError)
+
+
+def test_a_finished_run_is_not_trained_again(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "metrics.csv").read_bytes()
+    assert main(["resume", str(run)]) == 0
+    assert "is done: 1,000 of 1,000 steps" in capsys.readouterr().out
+    assert (run / "metrics.csv").read_bytes() == before
+
+
+def train_arguments(folder: Path, *more: str) -> list[str]:
+    short = ["--eval.episodes", "1", "--eval.video", "none", "--threads", "1"]
+    where = ["--preset", "smoke", "--run-dir", str(folder), "--agent.precision", "fp32"]
+    return ["train", "reach_duplo", *where, *short, *more]
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    from safetensors.torch import load_file
+
+    last = max(path for path in (run / "checkpoints").iterdir() if path.name.isdigit())
+    return load_file(last / "weights.safetensors")
+
+
+def assert_same(one: Path, other: Path) -> None:
+    first, second = weights(one), weights(other)
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_resuming_at_an_episodes_end_is_exact(tmp_path: Path) -> None:
+    """One run in one go, another stopped half-way: the same weights and the same metrics."""
+    every = ["--eval.every", "500", "--random-steps", "100"]
+    assert main(train_arguments(tmp_path / "whole", *every)) == 0
+    assert main(train_arguments(tmp_path / "parts", *every, "--steps", "500")) == 0
+    assert main(["resume", str(tmp_path / "parts"), "--steps", "1000"]) == 0
+    assert_same(tmp_path / "whole", tmp_path / "parts")
+    timeless = [
+        [{k: v for k, v in row.items() if not k.startswith("time/")} for row in rows(tmp_path / n)]
+        for n in ("whole", "parts")
+    ]
+    assert timeless[0] == timeless[1]
+
+
+def test_same_seed_same_weights(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        assert main(train_arguments(tmp_path / name, "--steps", "500")) == 0
+    assert_same(tmp_path / "one", tmp_path / "two")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
+    folder = tmp_path / "run"
+    command = [*MERL, *train_arguments(folder, "--steps", "20000")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: len(rows(folder)) >= 2 if (folder / "metrics.csv").exists() else False)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == code, err
+    assert "Traceback" not in err
+    assert f"merl resume {folder}" in out
+    saved = max(int(path.name) for path in (folder / "checkpoints").iterdir())
+    assert saved >= 500
+    assert main(["resume", str(folder), "--steps", str(saved + 300)]) == 0
+    steps = [int(row["step"]) for row in rows(folder)]
+    assert steps == sorted(set(steps))
+    assert steps[-1] == saved + 300
+
+
+def wait_for(condition, seconds: float = 120) -> None:  # type: ignore[no-untyped-def]
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it took too long"
+        time.sleep(0.1)
+
+
+BAD = {
+    "train": "missing from merl train: TASK",
+    "train reach_dulpo": "did you mean 'reach_duplo'",
+    "train reach_duplo --stepz 4": "did you mean --steps",
+    "train reach_duplo --preset lptop": "did you mean 'laptop'",
+    "train reach_duplo --preset=": "preset '' is unknown",
+    "train reach_duplo --steps 0": "steps must be at least 1, not 0",
+    "train reach_duplo --steps -5": "steps must be at least 1, not -5",
+    "train reach_duplo --steps five": "'five'",
+    "train reach_duplo --steps 100 --replay.batch-size 101": "batch-size 101 is more than the 100",
+    "train reach_duplo --replay.capacity 8 --replay.batch-size 16": "batch_size",
+    "train reach_duplo --replay.n-step 0": "n_step is 0",
+    "train reach_duplo --agent.tau 0": "(0, 1], not 0.0",
+    "train reach_duplo --agent.tau 1.01": "(0, 1], not 1.01",
+    "train reach_duplo --agent.tau nan": "(0, 1], not nan",
+    "train reach_duplo --agent.latent-dim 127": "does not split evenly",
+    "train reach_duplo --agent.vectors joints": "the environment gives ['proprio']",
+    "train reach_duplo --image-size 8": "16",
+    "train reach_duplo --renderer wrap": "'gl', 'warp'",
+    "train reach_duplo --minutes 0": "minutes must be above 0",
+    "trian reach_duplo": "did you mean 'train'",
+    "evaluate nowhere": "is not a run",
+    "resume nowhere": "is not a run",
+    "bench enw": "did you mean 'env'",
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    smoke = [] if "--preset" in line or not line.startswith("train r") else ["--preset", "smoke"]
+    assert main([*line.split(), *smoke]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("merl: error: ")
+    assert error.count("\n") == 1
+    assert BAD[line] in error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_cuda_where_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "reach_duplo", "--preset", "smoke", "--device", "cuda"]) == 2
+    assert "no CUDA device is found" in capsys.readouterr().err
+
+
+def test_an_existing_folder_is_left_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine").write_text("precious")
+    assert main(["train", "reach_duplo", "--preset", "smoke", "--run-dir", str(tmp_path)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_gl_without_opengl_names_the_way_on(tmp_path: Path) -> None:
+    arguments = ["train", "reach_duplo", "--preset", "smoke", "--renderer", "gl"]
+    done = subprocess.run(
+        [*MERL, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env=os.environ | {"MUJOCO_GL": "disabled"},
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "warp" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_it_trains_where_opengl_is_switched_off(tmp_path: Path) -> None:
+    arguments = train_arguments(tmp_path / "run", "--steps", "300", "--eval.every", "300")
+    done = subprocess.run(
+        [*MERL, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"MUJOCO_GL": "disabled"},
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert main(["--version"]) == 0
+    shown = capsys.readouterr().out
+    assert "evaluate" in shown
+    assert merl.__version__ in shown
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "--help"])
+    assert stop.value.code == 0
+    shown = capsys.readouterr().out
+    assert "--agent.tau" in shown
+    assert "Wrong" not in shown

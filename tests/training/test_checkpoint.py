@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+
+from merl.agents.ddpg import DDPG
+from merl.agents.merl import MERLConfig, make_merl
+from merl.core import MerlError
+from merl.training.checkpoint import Checkpoint, load_agent, save
+from toy import DotEnv
+
+CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")
+
+
+def agent(seed: int = 0, config: MERLConfig = CONFIG) -> DDPG:
+    env = DotEnv()
+    return make_merl(
+        config,
+        env.observation_space,
+        env.action_space,
+        frame_stack=3,
+        seed=seed,
+        device=torch.device("cpu"),
+    )
+
+
+def weights(of: DDPG) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in of.networks.parameters()])
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    saved, other = agent(0), agent(1)
+    save(tmp_path, 250, saved, {"a": 1}, score=2.5, keep=2)
+    found = Checkpoint.find(tmp_path)
+    load_agent(other, found)
+    assert (found.step, found.score, found.state()) == (250, 2.5, {"a": 1})
+    assert torch.equal(weights(saved), weights(other))
+    assert torch.equal(saved.learning.get_state(), other.learning.get_state())
+
+
+def test_keeps_the_last_and_the_best(tmp_path: Path) -> None:
+    for step, score in ((100, 1.0), (200, 9.0), (300, None), (400, 3.0), (500, None)):
+        save(tmp_path, step, agent(), {}, score=score, keep=2)
+    assert sorted(int(path.name) for path in tmp_path.iterdir()) == [200, 400, 500]
+    assert Checkpoint.find(tmp_path, "best").step == 200
+    assert Checkpoint.find(tmp_path, "latest").step == 500
+    assert Checkpoint.find(tmp_path, "400").step == 400
+
+
+@pytest.mark.parametrize("name", ["weights.safetensors", "learner.pt", "state.json"])
+@pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "remove"])
+def test_a_damaged_file_is_passed_over(
+    tmp_path: Path, name: str, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    for step in (100, 200):
+        save(tmp_path, step, agent(), {"step": step}, score=None, keep=2)
+    file = tmp_path / "00000200" / name
+    data = bytearray(file.read_bytes())
+    if damage == "flip":
+        data[len(data) // 2] ^= 1
+    elif damage == "truncate":
+        data = data[:-1]
+    elif damage == "empty":
+        data = bytearray()
+    file.write_bytes(data)
+    if damage == "remove":
+        file.unlink()
+    with caplog.at_level(logging.WARNING):
+        assert Checkpoint.find(tmp_path).step == 100
+    assert name in caplog.text
+    with pytest.raises(MerlError, match=name):
+        Checkpoint.find(tmp_path, "200")
+
+
+def test_none_at_all_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(MerlError, match="no whole checkpoint"):
+        Checkpoint.find(tmp_path)
+    with pytest.raises(MerlError, match="not there"):
+        Checkpoint.find(tmp_path, "300")
+
+
+def test_an_unknown_format_is_refused(tmp_path: Path) -> None:
+    save(tmp_path, 1, agent(), {}, score=None, keep=1)
+    manifest = tmp_path / "00000001" / "manifest.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"format": 99}))
+    with pytest.raises(MerlError, match="format 99"):
+        Checkpoint.open(tmp_path / "00000001")
+
+
+def test_other_networks_are_refused(tmp_path: Path) -> None:
+    save(tmp_path, 1, agent(), {}, score=None, keep=1)
+    wider = agent(config=MERLConfig(latent_dim=8, hidden_dim=32, precision="fp32"))
+    with pytest.raises(MerlError, match="cannot be loaded"):
+        load_agent(wider, Checkpoint.find(tmp_path))
+
+
+def test_a_failed_save_leaves_the_former_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path, 100, agent(), {}, score=None, keep=1)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("merl.training.checkpoint.torch.save", full)
+    with pytest.raises(OSError, match="No space"):
+        save(tmp_path, 200, agent(), {}, score=None, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["00000100"]
+    assert Checkpoint.find(tmp_path).step == 100
+
+
+def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
+    import pickle
+
+    class Evil:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return Path.touch, (Path(tmp_path / "owned"),)  # type: ignore[return-value]
+
+    saved = save(tmp_path / "run", 1, agent(), {}, score=None, keep=1)
+    (saved.path / "learner.pt").write_bytes(pickle.dumps(Evil()))
+    with pytest.raises(MerlError, match="cannot be loaded"):
+        load_agent(agent(), saved)
+    assert not (tmp_path / "owned").exists()

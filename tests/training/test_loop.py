@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from merl.agents.ddpg import DDPG
+from merl.agents.merl import MERLConfig, make_merl
+from merl.replay import Replay, ReplayConfig
+from merl.training.config import TrainConfig
+from merl.training.loop import Moment, Progress, Randomness, train
+from merl.training.rollout import Episode, FrameStack
+from toy import DotEnv
+
+CPU = torch.device("cpu")
+CONFIG = TrainConfig(
+    "dot",
+    steps=60,
+    random_steps=10,
+    seed_steps=20,
+    replay=ReplayConfig(batch_size=8),
+    agent=MERLConfig(latent_dim=8, hidden_dim=16, shift_pad=1, precision="fp32"),
+)
+
+
+class Parts:
+    """Everything that one run of the loop is made of."""
+
+    def __init__(self, config: TrainConfig = CONFIG, env: DotEnv | None = None) -> None:
+        self.config = config
+        self.env = env or DotEnv()
+        self.randomness = Randomness(config.seed)
+        space, actions = self.env.observation_space, self.env.action_space
+        self.agent: DDPG = make_merl(
+            config.agent, space, actions, frame_stack=3, seed=self.randomness.agent, device=CPU
+        )
+        self.replay = Replay(config.replay, space, actions, capacity=config.steps)
+        self.progress = Progress()
+        self.stack = FrameStack(3, ("image",), CPU)
+
+    def run(self) -> list[Moment]:
+        return list(
+            train(
+                self.env,
+                self.agent,
+                self.replay,
+                self.stack,
+                self.progress,
+                self.randomness,
+                self.config,
+            )
+        )
+
+    def weights(self) -> torch.Tensor:
+        return torch.cat([p.detach().flatten() for p in self.agent.networks.parameters()])
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.25, 0.5, 1.0, 2.0])
+def test_updates_per_step_are_held_exactly(ratio: float) -> None:
+    parts = Parts(dataclasses.replace(CONFIG, updates_per_step=ratio))
+    for moment in parts.run():
+        assert moment.updates == max(0, int((moment.step - 20) * ratio))
+    assert moment.step == 60
+
+
+def test_yields_every_step_and_tells_of_each_episode() -> None:
+    moments = Parts().run()
+    assert [m.step for m in moments] == list(range(1, 61))
+    assert [m.step for m in moments if m.episode] == [10, 20, 30, 40, 50, 60]
+    assert all(m.episode.length == 10 for m in moments if m.episode)
+    assert [m.step for m in moments if m.learning] == list(range(21, 61))
+
+
+def test_random_actions_come_first_and_fill_the_box() -> None:
+    parts = Parts(dataclasses.replace(CONFIG, steps=2000, random_steps=2000, seed_steps=2000))
+    parts.run()
+    actions = parts.replay.sample(4000, np.random.default_rng(0)).action.numpy()
+    assert actions.min() < -0.98
+    assert actions.max() > 0.98
+    assert abs(actions.mean()) < 0.1
+    assert abs(actions.std() - 1 / np.sqrt(3)) < 0.05
+
+
+@pytest.mark.parametrize(("truly", "expected"), [(True, 0.0), (False, 0.99)])
+def test_a_true_end_has_no_future_and_a_time_limit_has(truly: bool, expected: float) -> None:
+    parts = Parts(env=DotEnv(ends_truly=truly))
+    parts.run()
+    batch = parts.replay.sample(2000, np.random.default_rng(0))
+    last = batch.observation["joint"][:, 1] == 9  # the step before the end
+    assert last.any()
+    assert torch.allclose(batch.discount[last], torch.tensor(expected))
+
+
+def test_same_seed_same_weights_and_another_seed_others() -> None:
+    first, second = Parts(), Parts()
+    other = Parts(dataclasses.replace(CONFIG, seed=1))
+    for parts in (first, second, other):
+        parts.run()
+    assert torch.equal(first.weights(), second.weights())
+    assert not torch.equal(first.weights(), other.weights())
+
+
+def test_the_actors_stack_is_what_replay_samples() -> None:
+    parts = Parts(dataclasses.replace(CONFIG, steps=10, seed_steps=10))
+    env, stack = DotEnv(), FrameStack(3, ("image",), CPU)
+    parts.run()
+    observation, _ = env.reset(seed=parts.randomness.environment)
+    stack.reset(observation)
+    batch = parts.replay.sample(300, np.random.default_rng(0))
+    for step in range(10):
+        row = int(torch.nonzero(batch.observation["joint"][:, 1] == step)[0])
+        assert torch.equal(batch.observation["image"][row], stack.observation()["image"][0])
+        observation, *_ = env.step(batch.action[row].numpy())
+        stack.push(observation)
+
+
+def test_randomness_goes_on_from_its_state() -> None:
+    first, second = Randomness(3), Randomness(4)
+    first.actions.random(5)
+    second.load_state_dict(first.state_dict())
+    assert first.actions.random() == second.actions.random()
+    assert first.batches.random() == second.batches.random()
+
+
+def test_an_episode_sums_what_its_steps_bring() -> None:
+    episode = Episode()
+    for success in (0.0, 1.0, 0.0):
+        episode.add(0.5, {"success": success, "reward_terms": {"near": 0.25}})
+    assert episode.metrics() == {
+        "return": 1.5,
+        "length": 3.0,
+        "success_end": 0.0,
+        "success_any": 1.0,
+        "reward/near": 0.75,
+    }
+    silent = Episode()
+    silent.add(1.0, {})
+    assert silent.metrics() == {"return": 1.0, "length": 1.0}

@@ -27,7 +27,8 @@ MERL = [sys.executable, "-m", "merl.cli"]
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole `smoke` run, trained once."""
     folder = tmp_path_factory.mktemp("runs") / "a run, größer"
-    command = [*MERL, "train", "reach_duplo", "--preset", "smoke", "--run-dir", str(folder)]
+    arguments = ["train", "reach_duplo", "--preset", "smoke", "--run-dir", str(folder)]
+    command = [*MERL, *arguments, "--threads", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("preset smoke (as asked for")

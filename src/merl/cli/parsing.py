@@ -9,7 +9,6 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -43,15 +42,24 @@ def parse(target: Callable[..., T], prog: str, args: list[str], **options: Any) 
 
 
 def _one_line(box: str) -> str:
-    """The message of tyro's framed error, and the first flag that it thinks was meant."""
-    lines = [line.strip("│╭╰╮╯ ") for line in box.splitlines()][1:]  # less the frame's title
-    first = takewhile(lambda line: not line.startswith("─"), lines)
-    message = " ".join(line for line in first if line)
+    """The message of tyro's framed error, and the first flag that it thinks was meant.
+
+    Rules part the frame; the title stands in the frame itself, or, where the terminal knows ASCII
+    alone, in a part of its own.
+    """
+    lines = [line.strip().strip("│|").strip() for line in box.splitlines()]
+    parts: list[list[str]] = [[]]
+    for line in lines:
+        if line.startswith("╭") or (line and not set(line) - set("─-")):
+            parts.append([])
+        elif line and not line.startswith("╰"):
+            parts[-1].append(line)
+    message = " ".join(parts[1]) if len(parts) > 1 else ""
     if not message:
         return " ".join(box.split())
     message = message[0].lower() + message[1:]
     if "erhaps you meant" in box:
-        flags = [match for line in lines if (match := re.match(r"--[\w.-]+", line))]
+        flags = [match for line in lines if (match := re.match(r"--\w[\w.-]*", line))]
         if flags:
             message += f": did you mean {flags[0].group()}?"
     return message

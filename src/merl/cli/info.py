@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -67,8 +66,6 @@ def processor_features() -> list[str]:
 def _expected(preset: str) -> str:
     """What training would bring, from timing its update and its step."""
     config = dataclasses.replace(PRESETS[preset], task=TASK)
-    if config.env.renderer == "gl" and not torch.cuda.is_available():
-        return "made for a machine with CUDA"
     try:
         with Trainer.prepare(config) as trainer:
             timing = trainer.timing

@@ -258,9 +258,18 @@ def _draw_references(axes: Axes, references: Reference, rate: bool = False) -> l
     for value in references.values():
         axes.axhline(value, color=MUTED, lw=1.0, ls=(0, (4, 3)), zorder=1.2)
     return [
-        _Label(f"{label} {100 * value:.0f} %" if rate else f"{label} {value:.1f}", value, MUTED)
+        _Label(
+            f"{label} {_number(100 * value)} %" if rate else f"{label} {_number(value)}",
+            value,
+            MUTED,
+        )
         for label, value in references.items()
     ]
+
+
+def _number(value: float) -> str:
+    """Three digits, and no power of ten for what is next to nothing."""
+    return f"{value:.3g}" if abs(value) >= 0.05 else "0"
 
 
 def _smooth(of: Curve) -> tuple[Curve, int]:

@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("preset smoke (as asked for")
-    for said in ("take about", "GB for 1,000 steps", "random actions", "best known", "too early"):
+    for said in ("take about", "MB for 1,000 steps", "random actions", "best known", "too early"):
         assert said in done.stdout
     assert "Traceback" not in done.stderr
     return folder

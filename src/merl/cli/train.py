@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import torch
 import tyro
 from rich.console import Console
+from rich.filesize import decimal
 
 from merl.cli.parsing import meant, parse
 from merl.cli.summary import summarize
@@ -65,7 +66,7 @@ def _train(config: TrainConfig, what: str, resumed: Run | None = None, done: int
     with Trainer.prepare(config) as trainer:
         if resumed is None:
             trainer.check()
-        console.print(_outlook(trainer, what, done), highlight=False, soft_wrap=True)
+        console.print(_outlook(trainer, what, done), highlight=False)
         with ConsoleView(console) as view:
             outcome = trainer.resume(resumed, view) if resumed else trainer.start(view)
     folder = outcome.run.path
@@ -92,7 +93,7 @@ def _outlook(trainer: Trainer, what: str, done: int) -> str:
     lines += [
         f"an update takes {tried}; a step takes {1000 * timing.step:.1f} ms "
         f"({config.env.renderer} pictures)",
-        f"the replay takes {size / 1e9:.2f} GB for {config.capacity:,} steps",
+        f"the replay takes {decimal(size)} for {config.capacity:,} steps",
     ]
     return "\n".join(lines)
 

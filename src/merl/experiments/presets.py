@@ -18,13 +18,14 @@ PRESETS: dict[str, TrainConfig] = {
     "laptop": TrainConfig(
         _TASK,
         preset="laptop",
-        steps=200_000,
+        steps=150_000,
         random_steps=1000,
         seed_steps=2000,
-        updates_per_step=0.5,
         env=EnvConfig(renderer="warp", image_size=48),
         replay=ReplayConfig(batch_size=128),
-        agent=MERLConfig(conv_strides=(2, 2, 1, 1), shift_pad=2, hidden_dim=512),
+        agent=MERLConfig(
+            learning_rate=3e-4, conv_strides=(2, 2, 1, 1), shift_pad=2, hidden_dim=512
+        ),
         eval=EvaluationConfig(every=10_000, episodes=10, video="last"),
     ),
     # The whole pipeline in under a minute; too short to learn anything.

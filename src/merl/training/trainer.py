@@ -120,15 +120,25 @@ class Averages:
 
 @dataclass
 class Clock:
-    """Seconds of training, across interruptions, and the rates since the last reading."""
+    """Seconds of training, across interruptions, and the rates since the last reading.
+
+    Beside the wall's clock it keeps the processor's, of all threads together: on a machine that is
+    shared, the one that can be compared.
+    """
 
     before: float = 0.0
+    cpu_before: float = 0.0
+    _cpu_start: float = field(default_factory=time.process_time)
     _start: float = field(default_factory=time.perf_counter)
     _last: tuple[float, int, int] = (0.0, 0, 0)
 
     def seconds(self) -> float:
         """Since the run began, time away not counted."""
         return self.before + time.perf_counter() - self._start
+
+    def cpu_seconds(self) -> float:
+        """Processor time since the run began."""
+        return self.cpu_before + time.process_time() - self._cpu_start
 
     def rates(self, progress: Progress) -> dict[str, float]:
         """Steps and updates per second since the last call."""
@@ -138,6 +148,7 @@ class Clock:
         span = max(now - then, 1e-9)
         return {
             "time/seconds": now,
+            "time/cpu_seconds": self.cpu_seconds(),
             "time/steps_per_second": (progress.step - steps) / span,
             "time/updates_per_second": (progress.updates - updates) / span,
         }
@@ -289,7 +300,7 @@ class _Session:
         trainer.randomness.load_state_dict(state["randomness"])
         self.replay.load_state_dict(state["replay"])
         trainer.env.unwrapped.np_random.bit_generator.state = state["environment"]
-        self.clock = Clock(before=state["seconds"])
+        self.clock = Clock(before=state["seconds"], cpu_before=state["cpu_seconds"])
         self.metrics.trim(trainer.progress.step)
 
     def close(self) -> None:
@@ -354,6 +365,7 @@ class _Session:
             "replay": self.replay.state_dict(),
             "environment": trainer.env.unwrapped.np_random.bit_generator.state,
             "seconds": self.clock.seconds(),
+            "cpu_seconds": self.clock.cpu_seconds(),
         }
         try:
             self.replay.flush()

@@ -187,6 +187,51 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code:
     assert steps[-1] == saved + 300
 
 
+def test_one_process_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    command = [*MERL, *train_arguments(folder, "--steps", "20000", "--eval.every", "500")]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        wait_for(lambda: (folder / "checkpoints" / "00000500").is_dir())
+        assert main(["resume", str(folder)]) == 2
+        assert f"process {process.pid} is training in" in capsys.readouterr().err
+    finally:
+        process.kill()
+        process.wait()
+    last = max(int(path.name) for path in (folder / "checkpoints").iterdir() if path.suffix == "")
+    assert main(["resume", str(folder), "--steps", str(last + 250)]) == 0
+    record = json.loads((folder / "config.json").read_text())
+    assert record["config"]["steps"] == last + 250
+    assert [part["step"] for part in record["resumed"]] == [last]
+    assert main(["resume", str(folder)]) == 0
+    assert "is done" in capsys.readouterr().out
+
+
+def test_minutes_end_a_run_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = train_arguments(tmp_path / "run", "--steps", "100000", "--minutes", "0.05")
+    assert main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert "0.05 minutes, or 100,000 steps, of reach_duplo" in shown
+    assert f"resume {tmp_path / 'run'}" in shown
+    row = rows(tmp_path / "run")[-1]
+    assert row["eval/return"] != ""
+    assert float(row["time/seconds"]) < 60
+
+
+def test_what_cannot_learn_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = train_arguments(tmp_path / "run", "--steps", "250", "--render-size", "100")
+    assert main(arguments) == 0
+    assert "nothing will be learnt" in capsys.readouterr().out
+
+
+def test_a_sense_that_nobody_consumes_is_not_there(tmp_path: Path) -> None:
+    arguments = train_arguments(tmp_path / "run", "--steps", "300", "--agent.images")
+    assert main(arguments) == 0
+    record = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert record["config"]["env"]["observations"] == ["proprio"]
+    assert list(record["observation_space"]) == ["proprio"]
+
+
 def wait_for(condition, seconds: float = 120) -> None:  # type: ignore[no-untyped-def]
     deadline = time.monotonic() + seconds
     while not condition():
@@ -204,12 +249,14 @@ BAD = {
     "train reach_duplo --steps -5": "steps must be at least 1, not -5",
     "train reach_duplo --steps five": "'five'",
     "train reach_duplo --steps 100 --replay.batch-size 101": "batch-size 101 is more than the 100",
-    "train reach_duplo --replay.capacity 8 --replay.batch-size 16": "batch_size",
-    "train reach_duplo --replay.n-step 0": "n_step is 0",
+    "train reach_duplo --replay.capacity 8 --replay.batch-size 16": "batch",
+    "train reach_duplo --replay.n-step 0": "n-step is 0",
     "train reach_duplo --agent.tau 0": "(0, 1], not 0.0",
     "train reach_duplo --agent.tau 1.01": "(0, 1], not 1.01",
     "train reach_duplo --agent.tau nan": "(0, 1], not nan",
     "train reach_duplo --agent.latent-dim 127": "does not split evenly",
+    "train reach_duplo --observations state": "--agent.vectors state",
+    "train reach_duplo --updates-per-step inf": "updates-per-step must be at least 0, not inf",
     "train reach_duplo --agent.vectors joints": "the environment gives ['proprio']",
     "train reach_duplo --image-size 8": "16",
     "train reach_duplo --renderer wrap": "'gl', 'warp'",

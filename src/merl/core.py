@@ -31,6 +31,16 @@ class MerlError(Exception):
     """
 
 
+def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    """Refuse a value that is none of the choices.
+
+    Raises:
+        MerlError: naming the value and the choices.
+    """
+    if value not in choices:
+        raise MerlError(f"{name} {value!r} is unknown: choose from {', '.join(choices)}")
+
+
 def is_image(space: spaces.Space[Any]) -> bool:
     """Whether a modality of this space is an image: a uint8 box of shape (H, W, C)."""
     return space.dtype == np.uint8 and space.shape is not None and len(space.shape) == 3

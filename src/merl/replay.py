@@ -62,7 +62,9 @@ class ReplayConfig:
         for name in ("capacity", "batch_size", "n_step", "frame_stack"):
             value = getattr(self, name)
             if value < 1:
-                raise MerlError(f"replay.{name} is {value}: give a whole number of at least 1")
+                raise MerlError(
+                    f"replay.{name.replace('_', '-')} is {value}: give a whole number of at least 1"
+                )
         if not 0 <= self.discount <= 1:
             raise MerlError(f"replay.discount is {self.discount}: give a number from 0 to 1")
         _check_batch(self.batch_size, self.capacity)

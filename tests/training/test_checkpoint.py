@@ -51,6 +51,33 @@ def test_keeps_the_last_and_the_best(tmp_path: Path) -> None:
     assert Checkpoint.find(tmp_path, "400").step == 400
 
 
+def test_going_on_from_before_a_damaged_one_never_loses_the_good_ones(tmp_path: Path) -> None:
+    for step in (100, 300):
+        save(tmp_path, step, agent(), {}, score=float(step), keep=2)
+    (tmp_path / "00000300" / "learner.pt").write_bytes(b"")
+    (tmp_path / ".part-00000400").mkdir()
+    assert Checkpoint.find(tmp_path).step == 100
+    save(tmp_path, 200, agent(), {}, score=None, keep=1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000100", "00000200"]
+    assert Checkpoint.find(tmp_path).step == 200
+
+
+def test_a_checkpoint_of_another_device_loads(tmp_path: Path) -> None:
+    """CUDA's generators have a state of 16 bytes; the noise then starts anew."""
+    saved, other, twin = agent(0), agent(1), agent(1)
+
+    class OnCuda:
+        @staticmethod
+        def state_dict() -> dict[str, object]:
+            small = torch.zeros(16, dtype=torch.uint8)
+            return saved.state_dict() | {"acting": small, "learning": small}
+
+    save(tmp_path, 1, OnCuda(), {}, score=None, keep=1)  # type: ignore[arg-type]
+    load_agent(other, Checkpoint.find(tmp_path))
+    assert torch.equal(weights(saved), weights(other))
+    assert torch.equal(other.acting.get_state(), twin.acting.get_state())
+
+
 @pytest.mark.parametrize("name", ["weights.safetensors", "learner.pt", "state.json"])
 @pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "remove"])
 def test_a_damaged_file_is_passed_over(
@@ -106,7 +133,7 @@ def test_a_failed_save_leaves_the_former_one(
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("merl.training.checkpoint.torch.save", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="No space"):
         save(tmp_path, 200, agent(), {}, score=None, keep=1)
     assert [path.name for path in tmp_path.iterdir()] == ["00000100"]

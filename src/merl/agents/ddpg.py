@@ -18,13 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from merl.core import Batch, MerlError
+from merl.core import Batch, MerlError, check_choice
 from merl.networks.augmentation import draw_shifts
 from merl.networks.fusion import Fusion
 from merl.networks.heads import Actor, TwinCritic
 from merl.networks.representation import Encoders
 
 Precision = Literal["auto", "fp32", "bf16"]
+Target = Literal["heads", "heads_and_fusion"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class DDPGConfig:
     """Standard deviation of the exploration noise, also used in both updates."""
     noise_clip: float = 0.3
     """Bound of the noise in both updates; when acting it is not clipped."""
-    target: Literal["heads", "heads_and_fusion"] = "heads"
+    target: Target = "heads"
     """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too (DrQ-v2's)."""
     precision: Precision = "auto"
     """Arithmetic of the update: fp32, bf16 (weights, norms, targets and losses stay fp32), or auto,
@@ -48,12 +49,11 @@ class DDPGConfig:
     def __post_init__(self) -> None:
         if not 0 < self.learning_rate < math.inf:
             raise MerlError(f"agent.learning-rate must be above 0, not {self.learning_rate}")
-        if self.precision not in get_args(Precision):
-            choices = ", ".join(get_args(Precision))
-            raise MerlError(f"agent.precision {self.precision!r} is unknown: choose from {choices}")
+        check_choice("agent.precision", self.precision, get_args(Precision))
+        check_choice("agent.target", self.target, get_args(Target))
         if not 0 < self.tau <= 1:
             raise MerlError(f"agent.tau must lie in (0, 1], not {self.tau}")
-        if not self.noise_std >= 0:
+        if not 0 <= self.noise_std < math.inf:
             raise MerlError(f"agent.noise-std must be at least 0, not {self.noise_std}")
         if not self.noise_clip >= 0:
             raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
@@ -259,8 +259,12 @@ class DDPG:
         self.critic_target.load_state_dict(state["critic_target"])
         _load(self.critic_optimizer, state["critic_optimizer"])
         _load(self.actor_optimizer, state["actor_optimizer"])
-        self.acting.set_state(state["acting"].cpu())
-        self.learning.set_state(state["learning"].cpu())
+        for name in ("acting", "learning"):
+            generator: torch.Generator = getattr(self, name)
+            # A CPU's generator and CUDA's have states of other kinds: on another device than the
+            # one that was saved on, the noise starts anew.
+            if state[name].shape == generator.get_state().shape:
+                generator.set_state(state[name].cpu())
 
     # ----------------------------------------------------------------------------------------
 

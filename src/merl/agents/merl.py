@@ -16,13 +16,13 @@ Where the paper is silent or contradicts itself, `docs/paper.md` says what was c
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from gymnasium import spaces
 
 from merl.agents.ddpg import DDPG, DDPGConfig, Networks
-from merl.core import MerlError, is_image, is_vector
+from merl.core import MerlError, check_choice, is_image, is_vector
 from merl.networks.encoders import ConvEncoder, IdentityEncoder, MLPEncoder
 from merl.networks.fusion import Fusion, Squash
 from merl.networks.heads import Actor, HeadSize, TwinCritic
@@ -65,6 +65,7 @@ class MERLConfig(DDPGConfig):
             if getattr(self, name) < 1:
                 flag = name.replace("_", "-")
                 raise MerlError(f"agent.{flag} must be at least 1, not {getattr(self, name)}")
+        check_choice("agent.squash", self.squash, get_args(Squash))
         for name in ("shift_pad", "vector_encoder_dim"):
             if getattr(self, name) < 0:
                 flag = name.replace("_", "-")
@@ -82,10 +83,12 @@ def modalities(config: MERLConfig, space: spaces.Dict) -> tuple[tuple[str, ...],
     given = [k for k, s in space.items() if is_vector(s)]
     vectors = _keys("vectors", config.vectors, given, default=[k for k in given if k != "state"])
     if not images and not vectors:
-        raise MerlError(
-            f"MERL finds nothing to sense among {sorted(space)}: an image is a uint8 "
-            "box (H, W, C), a vector a float box (n,)"
+        hint = (
+            "name it with --agent.vectors state"
+            if "state" in given
+            else ("an image is a uint8 box (H, W, C), a vector a float box (n,)")
         )
+        raise MerlError(f"MERL finds nothing to sense among {sorted(space)}: {hint}")
     return images, vectors
 
 

@@ -67,7 +67,7 @@ def _expected(preset: str) -> str:
     """What training would bring, from timing its update and its step."""
     config = dataclasses.replace(PRESETS[preset], task=TASK)
     try:
-        with Trainer.prepare(config) as trainer:
+        with Trainer.prepare(config, new=False) as trainer:
             timing = trainer.timing
     except MerlError as error:
         return str(error)

@@ -7,6 +7,8 @@ import io
 import json
 import os
 import re
+import shutil
+import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from pathlib import Path
@@ -63,6 +65,14 @@ def _one_line(box: str) -> str:
         if flags:
             message += f": did you mean {flags[0].group()}?"
     return message
+
+
+def program() -> str:
+    """What to type to call this program again: `merl` if the shell would find it."""
+    found, called = shutil.which("merl"), Path(sys.argv[0])
+    if found or called.name != "merl":
+        return "merl"
+    return os.path.relpath(called)
 
 
 def meant(name: str, known: Iterable[str]) -> str:

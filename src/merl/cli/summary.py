@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from merl.cli.parsing import program
 from merl.core import MerlError, Observation
 from merl.report.figures import learning_curve
 from merl.training.config import TrainConfig
@@ -40,6 +41,12 @@ def summarize(outcome: Outcome, console: Console) -> None:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
     console.print(_verdict(chance, trained), highlight=False)
     console.print(_way_on(outcome), highlight=False, soft_wrap=True)
+    console.print(
+        f"(its replay, {run.replay}, is only needed to go on, and may be deleted otherwise)",
+        highlight=False,
+        soft_wrap=True,
+        style="dim",
+    )
 
 
 def random_evaluation(config: TrainConfig, episodes: int = 20) -> Evaluation:
@@ -93,5 +100,5 @@ def _verdict(chance: Evaluation, trained: Evaluation) -> str:
 def _way_on(outcome: Outcome) -> str:
     run, step = outcome.run, outcome.progress.step
     if step < run.config.steps:
-        return f"go on with: merl resume {run.path}"
-    return f"go on with: merl resume {run.path} --steps {2 * run.config.steps}"
+        return f"go on with: {program()} resume {run.path}"
+    return f"go on with: {program()} resume {run.path} --steps {2 * run.config.steps}"

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
 import torch
 import tyro
 from rich.console import Console
 from rich.filesize import decimal
 
-from merl.cli.parsing import meant, parse
+from merl.cli.parsing import meant, parse, program
 from merl.cli.summary import summarize
 from merl.core import MerlError
 from merl.experiments.presets import ABOUT, PRESETS
@@ -33,46 +34,55 @@ def train(args: list[str]) -> int:
 
 def resume(args: list[str]) -> int:
     """Go on with a run: merl resume RUN [--steps N] [--minutes N]."""
-
-    def command(
-        run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
-        steps: int | None = None,
-        minutes: float | None = None,
-    ) -> tuple[Path, dict[str, Any]]:
-        """Go on with a run from its last checkpoint.
-
-        Args:
-            run: The run's folder.
-            steps: Train to this many steps in all, in place of what the run was started with.
-            minutes: Stop after this many minutes in all; if not set, only the steps count.
-        """
-        changes: dict[str, Any] = {"minutes": minutes}
-        return run, changes | ({} if steps is None else {"steps": steps})
-
-    folder, changes = parse(command, "merl resume", args)
-    run = Run.open(folder)
-    config = dataclasses.replace(run.config, **changes)
-    step = Checkpoint.find(run.checkpoints).step
-    if step >= config.steps:
-        print(f"{folder} is done: {step:,} of {config.steps:,} steps; --steps N takes it further")
-        return 0
-    return _train(
-        config, f"run {folder} goes on at step {step:,}", resumed=Run(run.path, config), done=step
+    options = parse(ResumeOptions, "merl resume", args)
+    run = Run.open(options.run)
+    config = dataclasses.replace(
+        run.config,
+        minutes=options.minutes,
+        steps=options.steps or run.config.steps,
+        device=options.device or run.config.device,
     )
+    start = Checkpoint.find(run.checkpoints)
+    evaluated = start.state()["progress"]["evaluated"]
+    if start.step >= config.steps and evaluated >= start.step:
+        print(
+            f"{run.path} is done: {start.step:,} of {config.steps:,} steps; --steps N takes it "
+            "further"
+        )
+        return 0
+    run = dataclasses.replace(run, config=config)
+    return _train(config, f"run {run.path} goes on at step {start.step:,}", (run, start))
 
 
-def _train(config: TrainConfig, what: str, resumed: Run | None = None, done: int = 0) -> int:
+@dataclass(frozen=True)
+class ResumeOptions:
+    """Go on with a run from its last checkpoint."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    steps: int | None = None
+    """Train to this many steps in all, in place of what the run was started with."""
+    minutes: float | None = None
+    """Stop after this many minutes from now; if not set, only the steps count."""
+    device: Literal["auto", "cpu", "cuda"] | None = None
+    """Where the networks live from now on; where they were, if not set."""
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 1:
+            raise MerlError(f"steps must be at least 1, not {self.steps}")
+
+
+def _train(config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint] | None = None) -> int:
     console = Console()
-    with Trainer.prepare(config) as trainer:
-        if resumed is None:
-            trainer.check()
+    with Trainer.prepare(config, new=resumed is None) as trainer:
+        done = resumed[1].step if resumed else 0
         console.print(_outlook(trainer, what, done), highlight=False)
         with ConsoleView(console) as view:
-            outcome = trainer.resume(resumed, view) if resumed else trainer.start(view)
+            outcome = trainer.resume(*resumed, view) if resumed else trainer.start(view)
     folder = outcome.run.path
     if outcome.signal is not None:
         console.print(f"stopped at step {outcome.progress.step:,} and saved: go on with")
-        console.print(f"    merl resume {folder}", highlight=False, soft_wrap=True)
+        console.print(f"    {program()} resume {folder}", highlight=False, soft_wrap=True)
         return 128 + outcome.signal
     summarize(outcome, console)
     return 0
@@ -85,22 +95,33 @@ def _outlook(trainer: Trainer, what: str, done: int) -> str:
     size = replay_bytes(config.replay, trainer.space, trainer.action_space, config.capacity)
     tried = ", ".join(f"{1000 * s:.0f} ms in {how}" for how, s in timing.update.items())
     lines = [
-        f"{what}: {config.steps - done:,} steps of {config.task} on {config.device} take about "
+        f"{what}: {_amount(config, done)} of {config.task} on {config.device} take about "
         f"{timedelta(seconds=round(seconds))}",
     ]
     if seconds > 86_400 and config.preset != "laptop":
         lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
     lines += [
-        f"an update takes {tried}; a step takes {1000 * timing.step:.1f} ms "
+        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms a step "
         f"({config.env.renderer} pictures)",
         f"the replay takes {decimal(size)} for {config.capacity:,} steps",
     ]
+    if (config.steps - config.seed_steps) * config.updates_per_step < 1:
+        lines.append(
+            f"nothing will be learnt: the first update comes after {config.seed_steps:,} steps, "
+            "with --updates-per-step above 0"
+        )
     return "\n".join(lines)
+
+
+def _amount(config: TrainConfig, done: int) -> str:
+    """How much there is to do."""
+    steps = f"{config.steps - done:,} steps"
+    return steps if config.minutes is None else f"{config.minutes:g} minutes, or {steps},"
 
 
 def _choose_preset(args: list[str]) -> tuple[str, str]:
     """The preset's name and why it is this one."""
-    for index, arg in enumerate(args):
+    for index, arg in reversed(list(enumerate(args))):  # of two, the last one counts
         name = None
         if arg == "--preset" and index + 1 < len(args):
             name = args[index + 1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from merl.core import MerlError
+from merl.core import MerlError, check_choice
 
 RendererName = Literal["gl", "warp"]
 ProprioName = Literal["paper", "full"]
@@ -35,24 +35,17 @@ class EnvConfig:
     """Height and width of the pictures for people (videos), in pixels; at least 16."""
 
     def __post_init__(self) -> None:
-        _one_of("renderer", self.renderer, get_args(RendererName))
-        _one_of("proprio", self.proprio, get_args(ProprioName))
+        check_choice("renderer", self.renderer, get_args(RendererName))
+        check_choice("proprio", self.proprio, get_args(ProprioName))
         if not self.observations:
-            raise MerlError(f"observations is empty: name at least one of {_listed(OBSERVATIONS)}")
+            raise MerlError(
+                f"observations is empty: name at least one of {', '.join(OBSERVATIONS)}"
+            )
         for name in self.observations:
-            _one_of("observations", name, OBSERVATIONS)
+            check_choice("observations", name, OBSERVATIONS)
         for field in ("image_size", "render_size"):
             size = getattr(self, field)
             if type(size) is not int or size < SMALLEST_IMAGE:
                 raise MerlError(
                     f"{field} is {size!r}: give a whole number, at least {SMALLEST_IMAGE}"
                 )
-
-
-def _one_of(field: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise MerlError(f"{field} {value!r} is unknown: choose from {_listed(allowed)}")
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    return ", ".join(names)

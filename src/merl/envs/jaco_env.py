@@ -104,6 +104,8 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def render(self) -> NDArray[np.uint8] | None:
         """A picture for people, uint8 (render_size, render_size, 3), from the agent's camera."""
+        if self._physics is None:
+            raise MerlError("the environment is closed: make another one")
         return None if self.render_mode is None else self._picture(self.config.render_size)
 
     def close(self) -> None:

@@ -9,18 +9,23 @@ the disk, then renamed.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import logging
 import os
 import pickle
 import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from safetensors.torch import save as to_bytes
+from torch import nn
 
 from merl.core import Agent, MerlError
 
@@ -77,10 +82,11 @@ class Checkpoint:
             MerlError: there is none.
         """
         if which not in ("latest", "best"):
-            if not which.isdigit() or not (root / f"{int(which):08d}").is_dir():
-                steps = ", ".join(str(int(path.name)) for path in _folders(root))
-                raise MerlError(f"checkpoint {which!r} is not there: latest, best, or {steps}")
-            return cls.open(root / f"{int(which):08d}")
+            named = {str(int(path.name)): path for path in _folders(root)}
+            if which not in named:
+                there = ", ".join(["latest", "best", *named])
+                raise MerlError(f"checkpoint {which!r} is not there: choose from {there}")
+            return cls.open(named[which])
         whole = []
         for path in reversed(_folders(root)):
             try:
@@ -93,7 +99,7 @@ class Checkpoint:
         scored = [checkpoint for checkpoint in whole if checkpoint.score is not None]
         if not whole:
             raise MerlError(f"no whole checkpoint in {root}: the run ended before its first one")
-        return max(scored, key=lambda c: c.score or 0.0) if scored else whole[0]
+        return max(scored, key=lambda c: (c.score, c.step)) if scored else whole[0]
 
     def state(self) -> dict[str, Any]:
         """Where the run stood: what `save` was given."""
@@ -146,31 +152,58 @@ def save(
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
-    _prune(root, keep)
+    _prune(root, step, keep)
     return Checkpoint(final, step, score)
 
 
 def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
-    """Give an agent the weights, optimizers and generators of a checkpoint.
+    """Give an agent the weights, optimizers and generators of a checkpoint, to learn on.
 
     Raises:
         MerlError: a file cannot be read, or belongs to other networks.
     """
-    try:
-        weights = load_file(checkpoint.path / _WEIGHTS)
+    with _readable(checkpoint):
         learner = torch.load(checkpoint.path / _LEARNER, map_location="cpu", weights_only=True)
-        groups = {
-            group: {
-                name.removeprefix(f"{group}."): tensor
-                for name, tensor in weights.items()
-                if name.startswith(f"{group}.")
-            }
-            for group in _WEIGHT_GROUPS
-        }
-        agent.load_state_dict({**groups, **learner})
-    except (OSError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        agent.load_state_dict({**_weights(checkpoint), **learner})
+
+
+def load_networks(networks: nn.Module, checkpoint: Checkpoint) -> None:
+    """Give networks the weights of a checkpoint, to act with; it may be from another device.
+
+    Raises:
+        MerlError: a file cannot be read, or belongs to other networks.
+    """
+    with _readable(checkpoint):
+        networks.load_state_dict(_weights(checkpoint)["networks"])
+
+
+@contextmanager
+def _readable(checkpoint: Checkpoint) -> Iterator[None]:
+    """What goes wrong in reading, in one line."""
+    try:
+        yield
+    except (
+        OSError,
+        RuntimeError,
+        ValueError,
+        KeyError,
+        SafetensorError,
+        pickle.UnpicklingError,
+    ) as error:
         first = str(error).strip().split("\n")[0]
         raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {first}") from None
+
+
+def _weights(checkpoint: Checkpoint) -> dict[str, dict[str, torch.Tensor]]:
+    weights = load_file(checkpoint.path / _WEIGHTS)
+    return {
+        group: {
+            name.removeprefix(f"{group}."): tensor
+            for name, tensor in weights.items()
+            if name.startswith(f"{group}.")
+        }
+        for group in _WEIGHT_GROUPS
+    }
 
 
 def _write(folder: Path, agent: Mapping[str, Any], state: Mapping[str, Any]) -> None:
@@ -179,8 +212,11 @@ def _write(folder: Path, agent: Mapping[str, Any], state: Mapping[str, Any]) -> 
         for group in _WEIGHT_GROUPS
         for name, tensor in agent[group].items()
     }
-    save_file(weights, folder / _WEIGHTS)
-    torch.save({k: v for k, v in agent.items() if k not in _WEIGHT_GROUPS}, folder / _LEARNER)
+    learner = io.BytesIO()
+    torch.save({k: v for k, v in agent.items() if k not in _WEIGHT_GROUPS}, learner)
+    # Python writes the bytes: a full disk is then an OSError, whatever the format.
+    (folder / _WEIGHTS).write_bytes(to_bytes(weights))
+    (folder / _LEARNER).write_bytes(learner.getbuffer())
     (folder / _STATE).write_text(json.dumps(state))
 
 
@@ -191,11 +227,17 @@ def _folders(root: Path) -> list[Path]:
     return sorted(path for path in root.iterdir() if path.is_dir() and path.name.isdigit())
 
 
-def _prune(root: Path, keep: int) -> None:
+def _prune(root: Path, step: int, keep: int) -> None:
+    """Let go of what is neither among the last nor the best.
+
+    A checkpoint of a later step was passed over as damaged when the run went on from before it.
+    """
     folders = _folders(root)
-    scores = {path: score for path, score in _scores(folders) if score is not None}
+    past = [path for path in folders if int(path.name) <= step]
+    scores = {path: score for path, score in _scores(past) if score is not None}
     best = max(scores, key=lambda path: scores[path]) if scores else None
-    for path in folders[:-keep]:
+    stale = [path for path in root.glob(".part-*") if path.is_dir()]
+    for path in [*stale, *(path for path in folders if path not in past), *past[:-keep]]:
         if path != best:
             shutil.rmtree(path, ignore_errors=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -33,18 +34,22 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A training run; the values are Table 1's."""
+    """Train an agent on a task.
+
+    Without a preset these are Table 1's values; `merl train` takes them from the preset that it
+    names in its first line.
+    """
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """What is to be learnt, e.g. reach_duplo."""
     preset: str = "paper"
-    """Which set of values the others were taken from."""
+    """paper, laptop or smoke: which set of values the others are taken from."""
     seed: int = 0
     """The seed of everything random in the run."""
     steps: int = 1_000_000
     """Environment steps."""
     minutes: float | None = None
-    """Stop after this many minutes of training, if the steps are not done before."""
+    """Stop after this many minutes (since start or resume), if the steps are not done before."""
     run_dir: Path | None = None
     """The run's folder, which must not exist yet; runs/TASK-PRESET-sSEED (or -2, -3, ...) if not
     set."""
@@ -79,8 +84,10 @@ class TrainConfig:
             raise MerlError(f"minutes must be above 0, not {self.minutes}")
         if self.threads is not None and self.threads < 1:
             raise MerlError(f"threads must be at least 1, not {self.threads}")
-        if not self.updates_per_step >= 0:
-            raise MerlError(f"updates-per-step must be at least 0, not {self.updates_per_step}")
+        for name in ("updates_per_step", "save_every"):
+            if not 0 <= getattr(self, name) < math.inf:
+                flag = name.replace("_", "-")
+                raise MerlError(f"{flag} must be at least 0, not {getattr(self, name)}")
         if self.replay.batch_size > self.steps:
             raise MerlError(
                 f"replay.batch-size {self.replay.batch_size} is more than the {self.steps} steps "

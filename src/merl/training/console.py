@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from datetime import timedelta
+from statistics import mean
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -16,6 +18,7 @@ from merl.training.loop import Moment
 from merl.training.run import Run
 from merl.training.trainer import Trainer
 
+RECENT = 10  # training episodes that the shown means are of
 PLAIN_INTERVAL = 30.0  # seconds between lines where there is no terminal
 
 
@@ -33,6 +36,7 @@ class ConsoleView:
         )
         self._live = Live(console=console, refresh_per_second=4, transient=False)
         self._numbers: dict[str, float] = {}
+        self._recent: deque[dict[str, float]] = deque(maxlen=RECENT)
         self._evaluation = Text("none yet", style="dim")
         self._note = ""
         self._said = self._recent_time = time.perf_counter()
@@ -67,6 +71,7 @@ class ConsoleView:
         )
         if metrics:
             self._numbers = metrics
+            self._recent.append(metrics)
             self._show(moment)
 
     def evaluating(self, episode: int, total: int) -> None:
@@ -99,7 +104,7 @@ class ConsoleView:
             n = self._numbers
             self.console.print(
                 f"step {moment.step:,}/{self._total:,}  "
-                f"return {n['train/return']:.1f}  "
+                f"{self._training()}  "
                 f"{n['time/steps_per_second']:.0f} steps/s  "
                 f"{n['time/updates_per_second']:.0f} updates/s  "
                 f"{self._time_left(moment.step)}",
@@ -126,7 +131,7 @@ class ConsoleView:
                 f"{n['time/steps_per_second']:.0f} steps/s",
                 f"{n['time/updates_per_second']:.0f} updates/s",
             )
-            table.add_row("training", f"return {n['train/return']:.1f}", self._success())
+            table.add_row("training", self._training())
             if "learn/q" in n:
                 table.add_row(
                     "learner", f"Q {n['learn/q']:.2f}", f"critic loss {n['learn/critic_loss']:.2g}"
@@ -134,9 +139,13 @@ class ConsoleView:
         table.add_row("evaluation", self._evaluation)
         return Group(self._bar, table, Text(self._note, style="dim"))
 
-    def _success(self) -> str:
-        end = self._numbers.get("train/success_end")
-        return "" if end is None else f"success {'yes' if end else 'no'}"
+    def _training(self) -> str:
+        """Return and success of the last training episodes, noise and all."""
+        values = f"return {mean(row['train/return'] for row in self._recent):.1f}"
+        ends = [row["train/success_end"] for row in self._recent if "train/success_end" in row]
+        if ends:
+            values += f", success {mean(ends):.0%}"
+        return f"{values} (last {len(self._recent)})"
 
 
 def describe(evaluation: Evaluation) -> str:

@@ -19,7 +19,7 @@ from merl.agents.merl import make_merl
 from merl.core import Agent, MerlError, Observation, is_image
 from merl.envs import make_env
 from merl.statistics import Interval, bootstrap_interval, wilson_interval
-from merl.training.checkpoint import Checkpoint, load_agent
+from merl.training.checkpoint import Checkpoint, load_networks
 from merl.training.config import TrainConfig
 from merl.training.rollout import Episode, FrameStack
 from merl.training.run import Run
@@ -150,6 +150,7 @@ def evaluate(
     reset: Callable[[], None] = lambda: None,
     video: Path | None = None,
     tick: Callable[[int], None] = lambda episode: None,
+    warn: Callable[[str], None] | None = None,
 ) -> Evaluation:
     """Run episodes from the evaluation's starts.
 
@@ -160,12 +161,21 @@ def evaluate(
         reset: called before each episode.
         video: where to film the first episode.
         tick: called after every step, with the number of the episode; may raise to end it.
+        warn: is told if the video cannot be made, and the evaluation goes on without it; without
+            `warn` that is an error.
     """
     results = []
     for index in range(episodes):
         reset()
         film = video if index == 0 else None
-        results.append(_run_episode(act, env, index, film, tick))
+        try:
+            results.append(_run_episode(act, env, index, film, tick))
+        except MerlError as error:
+            if film is None or warn is None:
+                raise
+            warn(str(error))
+            reset()
+            results.append(_run_episode(act, env, index, None, tick))
     return summarize(results)
 
 
@@ -246,5 +256,5 @@ def load_policy(run: str | Path, *, checkpoint: str = "latest") -> Policy:
         seed=0,
         device=device,
     )
-    load_agent(agent, saved)
+    load_networks(agent.networks, saved)
     return Policy(agent, config, observation_space, device, step=saved.step)

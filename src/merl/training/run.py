@@ -12,6 +12,7 @@ curve.png       the learning curve, drawn when training ends
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import itertools
 import json
 import os
@@ -19,7 +20,8 @@ import platform
 import subprocess
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -34,6 +36,8 @@ from merl.core import MerlError
 from merl.training.config import TrainConfig
 
 CONFIG_FILE = "config.json"
+LOCK_FILE = "lock"
+FORMAT = 1
 PACKAGES = ("torch", "numpy", "gymnasium", "dm_control", "mujoco", "mujoco-warp", "warp-lang")
 T = TypeVar("T")
 
@@ -57,7 +61,7 @@ class Run:
         path = run_path(config)
         refuse_existing(path)
         record = {
-            "format": 1,
+            "format": FORMAT,
             "merl": merl.__version__,
             "task": config.task,
             "preset": config.preset,
@@ -71,10 +75,11 @@ class Run:
         }
         try:
             path.mkdir(parents=True)
-            (path / CONFIG_FILE).write_text(json.dumps(record, indent=1))
         except OSError as error:
             raise MerlError(f"the run's folder {path} cannot be made: {error.strerror}") from None
-        return cls(path, config)
+        run = cls(path, config)
+        run._write(record)
+        return run
 
     @classmethod
     def open(cls, path: Path) -> Run:
@@ -85,12 +90,59 @@ class Run:
         """
         try:
             record = json.loads((path / CONFIG_FILE).read_text())
+            number = record["format"]
             config = from_plain(TrainConfig, record["config"])
         except FileNotFoundError:
             raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise MerlError(f"{path / CONFIG_FILE} cannot be read: {error}") from None
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise MerlError(f"{path / CONFIG_FILE} cannot be read: {error!r}") from None
+        if number != FORMAT:
+            raise MerlError(f"{path} has format {number}, this merl reads {FORMAT}")
         return cls(path, dataclasses.replace(config, run_dir=path))
+
+    def record_resumption(self, step: int) -> None:
+        """Note that the run goes on from `step`, with what; from now on its config is this one."""
+        record = json.loads((self.path / CONFIG_FILE).read_text())
+        record["config"] = to_plain(self.config)
+        record.setdefault("resumed", []).append(
+            {
+                "step": step,
+                "merl": merl.__version__,
+                "versions": package_versions(),
+                "commit": _commit(),
+                "machine": machine(),
+            }
+        )
+        self._write(record)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep every other process from training in this folder; the lock dies with the process.
+
+        Raises:
+            MerlError: another process trains here.
+        """
+        with (self.path / LOCK_FILE).open("a+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                raise MerlError(
+                    f"process {file.read().strip()} is training in {self.path}: stop it first"
+                ) from None
+            file.truncate(0)
+            file.write(str(os.getpid()))
+            file.flush()
+            yield
+
+    def _write(self, record: Mapping[str, Any]) -> None:
+        """Replace `config.json` whole."""
+        part = self.path / f".{CONFIG_FILE}.part"
+        try:
+            part.write_text(json.dumps(record, indent=1))
+            part.replace(self.path / CONFIG_FILE)
+        except OSError as error:
+            raise MerlError(f"{self.path} cannot be written to: {error.strerror}") from None
 
     @property
     def checkpoints(self) -> Path:
@@ -109,11 +161,11 @@ class Run:
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
         """What the agent consumes, and its actions, without building the environment."""
-        record = json.loads((self.path / CONFIG_FILE).read_text())
-        observation: dict[str, spaces.Space[Any]] = {
-            key: _box(d) for key, d in record["observation_space"].items()
-        }
-        return spaces.Dict(observation), _box(record["action_space"])
+        try:
+            record = json.loads((self.path / CONFIG_FILE).read_text())
+            return _recorded_spaces(record)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise MerlError(f"{self.path / CONFIG_FILE} cannot be read: {error!r}") from None
 
 
 def run_path(config: TrainConfig) -> Path:
@@ -205,6 +257,13 @@ def _commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip() or None
+
+
+def _recorded_spaces(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box]:
+    observation: dict[str, spaces.Space[Any]] = {
+        key: _box(described) for key, described in record["observation_space"].items()
+    }
+    return spaces.Dict(observation), _box(record["action_space"])
 
 
 def _describe(space: spaces.Space[Any]) -> dict[str, Any]:

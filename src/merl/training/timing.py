@@ -14,7 +14,8 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
-from merl.agents.merl import MERLConfig, make_merl
+from merl.agents.ddpg import DDPG
+from merl.agents.merl import make_merl
 from merl.core import Batch, is_image
 from merl.training.config import TrainConfig
 
@@ -39,7 +40,7 @@ class Timing:
 
     Attributes:
         update: of one update, for each way that was tried.
-        step: of one environment step, picture included.
+        step: of acting and one environment step, picture included.
     """
 
     update: Mapping[Arithmetic, float]
@@ -61,7 +62,9 @@ class Timing:
         return min(whole, (config.minutes or float("inf")) * 60)
 
 
-def measure(config: TrainConfig, env: gymnasium.Env[Any, Any], device: torch.device) -> Timing:
+def measure(
+    config: TrainConfig, env: gymnasium.Env[Any, Any], space: spaces.Dict, device: torch.device
+) -> Timing:
     """Time the environment's step, and the update in every way that the config leaves open.
 
     Precision first, on one thread; then the fastest on all threads. More threads are not always
@@ -72,48 +75,58 @@ def measure(config: TrainConfig, env: gymnasium.Env[Any, Any], device: torch.dev
     precisions: tuple[Literal["fp32", "bf16"], ...] = (
         ("fp32", "bf16") if asked == "auto" else (asked,)
     )
+    assert isinstance(env.action_space, spaces.Box)
+    batch = _random_batch(config, space, env.action_space).to(device)
     update: dict[Arithmetic, float] = {}
+
+    def attempt(arithmetic: Arithmetic) -> DDPG:
+        torch.set_num_threads(arithmetic.threads)
+        agent = _agent(config, space, batch, device, arithmetic.precision)
+        update[arithmetic] = _time_update(agent, batch)
+        return agent
+
     for precision in precisions:
-        _try(Arithmetic(precision, threads), update, config, env, device)
+        agent = attempt(Arithmetic(precision, threads))
     fastest = min(update, key=lambda arithmetic: update[arithmetic])
     if config.threads is None and cores > threads:
-        _try(Arithmetic(fastest.precision, cores), update, config, env, device)
-    return Timing(update, _time_step(env))
+        attempt(Arithmetic(fastest.precision, cores))
+    torch.set_num_threads(threads)
+    return Timing(update, _time_step(env) + _time_acting(agent, batch))
 
 
-def _try(
-    arithmetic: Arithmetic,
-    update: dict[Arithmetic, float],
+def _agent(
     config: TrainConfig,
-    env: gymnasium.Env[Any, Any],
+    space: spaces.Dict,
+    batch: Batch,
     device: torch.device,
-) -> None:
-    torch.set_num_threads(arithmetic.threads)
-    update[arithmetic] = _time_update(config, env, device, arithmetic.precision)
-
-
-def _time_update(
-    config: TrainConfig, env: gymnasium.Env[Any, Any], device: torch.device, precision: Any
-) -> float:
-    space, actions = env.observation_space, env.action_space
-    assert isinstance(space, spaces.Dict)
-    assert isinstance(actions, spaces.Box)
-    agent_config: MERLConfig = dataclasses.replace(config.agent, precision=precision)
-    agent = make_merl(
-        agent_config,
+    precision: Literal["fp32", "bf16"],
+) -> DDPG:
+    return make_merl(
+        dataclasses.replace(config.agent, precision=precision),
         space,
-        actions,
+        spaces.Box(-1.0, 1.0, batch.action.shape[1:]),
         frame_stack=config.replay.frame_stack,
         seed=0,
         device=device,
     )
-    batch = _random_batch(config, space, actions).to(device)
 
+
+def _time_update(agent: DDPG, batch: Batch) -> float:
     def update() -> None:
         float(agent.update(batch)["critic_loss"])  # reading it waits for the device
 
     update()  # the first one also sets up what the others use
     return _median_seconds(update)
+
+
+def _time_acting(agent: DDPG, batch: Batch) -> float:
+    one = {key: value[:1] for key, value in batch.observation.items()}
+
+    def act() -> None:
+        agent.act(one, explore=True).cpu()
+
+    act()
+    return _median_seconds(act)
 
 
 def _time_step(env: gymnasium.Env[Any, Any]) -> float:

@@ -1,7 +1,7 @@
 """The command line.
 
-Exit codes: 0 done; 2 bad input, told in one line; 130 and 143 stopped by Ctrl-C or SIGTERM, saved
-and ready to go on.
+Exit codes: 0 done; 2 bad input, told in one line; 129, 130 and 143 stopped by SIGHUP, Ctrl-C or
+SIGTERM, saved and ready to go on.
 """
 
 from __future__ import annotations

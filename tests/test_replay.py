@@ -567,7 +567,7 @@ def test_what_a_dead_process_had_begun_to_reserve_is_replaced(tmp_path):
 def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, where, what):
     settings = ReplayConfig()
     room = 30_000_000
-    monkeypatch.setattr(f"merl.replay.{where}", lambda *_: room)
+    monkeypatch.setattr(f"merl.replay.config.{where}", lambda *_: room)
     directory = tmp_path / "run" / "replay"
     with pytest.raises(MerlError, match=what) as caught:
         Replay(settings, OBSERVATIONS, ACTIONS, directory=directory)
@@ -582,16 +582,16 @@ def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, whe
 
 
 def test_memory_alone_counts_without_a_directory(monkeypatch):
-    monkeypatch.setattr("merl.replay.free_disk", lambda *_: 0)
+    monkeypatch.setattr("merl.replay.config.free_disk", lambda *_: 0)
     make()
-    monkeypatch.setattr("merl.replay.available_memory", lambda: 10)
+    monkeypatch.setattr("merl.replay.config.available_memory", lambda: 10)
     with pytest.raises(MerlError, match="free some"):
         make()
 
 
 def test_opened_again_on_a_disk_that_it_fills_itself(tmp_path, monkeypatch):
     make(tmp_path)
-    monkeypatch.setattr("merl.replay.free_disk", lambda *_: 0)
+    monkeypatch.setattr("merl.replay.config.free_disk", lambda *_: 0)
     make(tmp_path)
     with pytest.raises(MerlError, match="of disk"):
         make(tmp_path, capacity=25)
@@ -612,14 +612,15 @@ def test_opened_again_on_a_disk_that_it_fills_itself(tmp_path, monkeypatch):
     ],
 )
 def test_a_config_out_of_range_names_field_and_value(name, value):
-    with pytest.raises(MerlError, match=rf"replay\.{name}\b.* {value}"):
+    flag = name.replace("_", "-")
+    with pytest.raises(MerlError, match=rf"replay\.{flag} .* {value}"):
         ReplayConfig(**{name: value})
 
 
 def test_a_batch_larger_than_the_replay_is_refused():
-    with pytest.raises(MerlError, match=r"batch_size 256 .* of 100 steps"):
+    with pytest.raises(MerlError, match=r"batch-size 256 .* of 100 steps"):
         ReplayConfig(capacity=100)
-    with pytest.raises(MerlError, match=r"batch_size 256 .* of 100 steps"):
+    with pytest.raises(MerlError, match=r"batch-size 256 .* of 100 steps"):
         Replay(ReplayConfig(), OBSERVATIONS, ACTIONS, capacity=100)
 
 

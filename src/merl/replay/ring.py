@@ -1,4 +1,4 @@
-"""A ring of single frames; stacks of frames and n-step returns are made when sampled.
+"""The ring: slots, moments and steps; stacks and n-step returns are made when sampled.
 
 One slot holds one *moment*: what was seen, and the action, reward and discount that led there. An
 episode of T steps is T + 1 moments in a row, the first of which was led to by nothing. Moments are
@@ -8,11 +8,6 @@ numbered 1, 2, 3, ... as they come; moment i lies in slot (i - 1) mod slots.
     position      0      1      2      3      0      1      in its episode; 0 begins one
     step              *      *      *             *         o_t -> o_{t+1}, what is sampled
 
-In a directory each field is a file of its own, `<field>.bin`: the raw little-endian array
-(slots, *shape) in C order, memory-mapped. `replay.json` lists fields, types, shapes and the number
-of slots; it is written last, so a directory that has it is whole. An observation's key is quoted as
-in a URL: `observation.image.bin`, `observation.arm%2Fjoints.bin`.
-
 A process that is killed loses nothing that was written. A machine that loses power loses what came
 after the last `flush`, and where that had begun to overwrite old moments, those may be torn. A
 checkpoint calls `flush` and keeps `state_dict`.
@@ -20,16 +15,11 @@ checkpoint calls `flush` and keeps `state_dict`.
 
 from __future__ import annotations
 
-import json
-import math
 import mmap
-import os
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import gymnasium
 import numpy as np
@@ -37,50 +27,8 @@ import torch
 from numpy.typing import NDArray
 
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.resources import available_memory, existing_parent, free_disk, reserve_file
-
-_FORMAT = 1
-_HEADER = "replay.json"
-
-
-@dataclass(frozen=True)
-class ReplayConfig:
-    """What the replay keeps and how it is sampled."""
-
-    capacity: int = 1_000_000
-    """Steps that are kept; a run that is shorter reserves only its own length."""
-    batch_size: int = 256
-    """Samples in one update."""
-    n_step: int = 3
-    """Rewards that are summed before the critic's estimate takes over."""
-    frame_stack: int = 3
-    """Pictures in a row that make one observation."""
-    discount: float = 0.99
-    """What a reward is worth one step later (gamma), from 0 to 1."""
-
-    def __post_init__(self) -> None:
-        for name in ("capacity", "batch_size", "n_step", "frame_stack"):
-            value = getattr(self, name)
-            if value < 1:
-                raise MerlError(
-                    f"replay.{name.replace('_', '-')} is {value}: give a whole number of at least 1"
-                )
-        if not 0 <= self.discount <= 1:
-            raise MerlError(f"replay.discount is {self.discount}: give a number from 0 to 1")
-        _check_batch(self.batch_size, self.capacity)
-
-
-@dataclass(frozen=True)
-class _Field:
-    """One array of the ring, without its first axis, the slots."""
-
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-
-    @property
-    def bytes(self) -> int:
-        """Bytes of one slot."""
-        return self.dtype.itemsize * math.prod(self.shape)
+from merl.replay.config import ReplayConfig, check_fits, slots_for
+from merl.replay.storage import check_value, field_name, fields_of, open_files
 
 
 @dataclass(frozen=True)
@@ -92,47 +40,6 @@ class _Picks:
     action: NDArray[np.int64]  # (B,) slot of the moment that a_t led to
     reward: NDArray[np.float32]  # (B,)
     discount: NDArray[np.float32]  # (B,)
-
-
-def replay_bytes(
-    config: ReplayConfig,
-    observation_space: gymnasium.spaces.Dict,
-    action_space: gymnasium.spaces.Box,
-    capacity: int | None = None,
-) -> int:
-    """Bytes that a replay takes, on disk or in memory; `capacity` counts steps."""
-    steps = config.capacity if capacity is None else capacity
-    slot = sum(field.bytes for field in _fields(observation_space, action_space).values())
-    return slot * _slots(steps, config.frame_stack)
-
-
-def check_fits(
-    config: ReplayConfig,
-    observation_space: gymnasium.spaces.Dict,
-    action_space: gymnasium.spaces.Box,
-    *,
-    directory: Path | None = None,
-    capacity: int | None = None,
-) -> None:
-    """Refuse a replay that the disk or the memory cannot hold, before anything is created.
-
-    Even a replay on disk has to fit into memory: one that does not reads the disk for every sample.
-
-    Raises:
-        MerlError: it does not fit: the message names the largest capacity that would. Or it is
-            smaller than one batch.
-    """
-    steps = config.capacity if capacity is None else capacity
-    _check_batch(config.batch_size, steps)
-    room = {"of memory are available": available_memory()}
-    if directory is not None:
-        where = existing_parent(directory)
-        ours = sum(file.stat().st_size for file in directory.glob("*.bin"))  # if it is opened again
-        room[f"of disk are free in {where}"] = free_disk(where) + ours
-    what, least = min(room.items(), key=lambda item: item[1])
-    need = replay_bytes(config, observation_space, action_space, steps)
-    if need > least:
-        raise _too_large(config, observation_space, action_space, steps, what, least)
 
 
 class Replay:
@@ -173,8 +80,8 @@ class Replay:
         check_fits(
             config, observation_space, action_space, directory=directory, capacity=self.capacity
         )
-        fields = _fields(observation_space, action_space)
-        slots = _slots(self.capacity, config.frame_stack)
+        fields = fields_of(observation_space, action_space)
+        slots = slots_for(self.capacity, config.frame_stack)
         self._files: dict[str, mmap.mmap] = {}
         self._data: dict[str, NDArray[Any]]
         if directory is None:
@@ -182,12 +89,12 @@ class Replay:
                 name: np.zeros((slots, *field.shape), field.dtype) for name, field in fields.items()
             }
         else:
-            self._files = _open(directory, fields, slots, self.capacity)
+            self._files = open_files(directory, fields, slots, self.capacity)
             self._data = {
                 name: np.frombuffer(self._files[name], field.dtype).reshape(-1, *field.shape)
                 for name, field in fields.items()
             }
-        self._keys = {key: _field_name(key) for key in observation_space.spaces}
+        self._keys = {key: field_name(key) for key in observation_space.spaces}
         self._slots = len(self._data["moment"])
         self._moments = self._steps = 0  # ever written
         self._first = 0  # the oldest step that can be sampled
@@ -304,7 +211,7 @@ class Replay:
         values = {name: observation.get(key) for key, name in self._keys.items()}
         values["action"] = np.zeros_like(data["action"][0]) if action is None else action
         for name, value in values.items():
-            _check_value(name, value, data[name])
+            check_value(name, value, data[name])
         moment = self._moments + 1
         slot = self._slot(moment)
         data["moment"][slot] = 0  # while it is written it is no moment, should the process die here
@@ -385,193 +292,3 @@ class Replay:
             index = slots if array.dtype == np.uint8 else slots[:, -1]
             observation[key] = torch.from_numpy(array.take(index, axis=0))
         return observation
-
-
-def _slots(capacity: int, frame_stack: int) -> int:
-    """Moments that hold `capacity` steps of episodes of a hundred steps or more.
-
-    An episode has one moment more than steps, and the oldest step needs its whole stack. Episodes
-    shorter than a hundred steps fill the slots before the capacity is reached. What is to spare
-    also lets a run go back to its last checkpoint after the ring has wrapped.
-    """
-    return capacity + capacity // 100 + frame_stack
-
-
-def _fields(
-    observation_space: gymnasium.spaces.Dict, action_space: gymnasium.spaces.Box
-) -> dict[str, _Field]:
-    """The arrays of the ring, by name."""
-    fields: dict[str, _Field] = {}
-    for key, space in observation_space.spaces.items():
-        shape = space.shape or ()
-        box = isinstance(space, gymnasium.spaces.Box) and math.prod(shape) > 0
-        if box and space.dtype == np.uint8 and len(shape) == 3:
-            dtype: np.dtype[Any] = np.dtype("u1")
-        elif box and np.issubdtype(space.dtype, np.floating) and len(shape) == 1:
-            dtype = np.dtype("<f4")
-        else:
-            raise MerlError(
-                f"observation {key!r} is {space}: replay keeps images, Box(H, W, C) of uint8, and "
-                "vectors, Box(n) of floats; wrap the environment or leave the key out"
-            )
-        fields[_field_name(key)] = _Field(dtype, shape)
-    if len(action_space.shape) != 1 or not math.prod(action_space.shape):
-        raise MerlError(f"the action space is {action_space}: replay keeps vectors, Box(n)")
-    fields["action"] = _Field(np.dtype("<f4"), action_space.shape)
-    fields["reward"] = _Field(np.dtype("<f4"), ())
-    fields["discount"] = _Field(np.dtype("<f4"), ())
-    fields["position"] = _Field(np.dtype("<i4"), ())
-    fields["moment"] = _Field(np.dtype("<i8"), ())  # its number; 0 while there is none
-    return fields
-
-
-def _field_name(key: str) -> str:
-    """The field of an observation's key; also a file name, so a slash is quoted."""
-    return f"observation.{quote(key, safe='')}"
-
-
-def _check_batch(batch_size: int, capacity: int) -> None:
-    """Raise MerlError for a batch that the replay could never fill with different steps."""
-    if batch_size > capacity:
-        raise MerlError(
-            f"replay.batch_size {batch_size} is larger than the replay of {capacity} steps: "
-            f"give at most {capacity}, or more steps"
-        )
-
-
-def _check_value(name: str, value: Any, array: NDArray[Any]) -> None:
-    """Raise MerlError unless the value can be stored in one slot of the array as it is."""
-    if value is None:
-        raise MerlError(f"{name} is missing, although the observation space has it")
-    value = np.asarray(value)
-    kind_fits = value.dtype.kind == array.dtype.kind and (
-        array.dtype != np.uint8 or value.dtype == np.uint8
-    )
-    if value.shape != array.shape[1:] or not kind_fits:
-        raise MerlError(
-            f"{name} is {value.dtype} {value.shape}, but its space says "
-            f"{array.dtype} {array.shape[1:]}: mend what the environment or the agent returns"
-        )
-
-
-def _too_large(
-    config: ReplayConfig,
-    observation_space: gymnasium.spaces.Dict,
-    action_space: gymnasium.spaces.Box,
-    capacity: int,
-    what: str,
-    room: int,
-) -> MerlError:
-    """The error that names the largest capacity for which there is room."""
-    need = replay_bytes(config, observation_space, action_space, capacity)
-    low, high = 0, capacity  # low fits, high does not
-    while high - low > 1:
-        middle = (low + high) // 2
-        fits = replay_bytes(config, observation_space, action_space, middle) <= room
-        low, high = (middle, high) if fits else (low, middle)
-    way_out = f"--replay.capacity {low} would fit" if low else "free some"
-    return MerlError(
-        f"a replay of {capacity:,} steps needs {need / 1e9:.3g} GB, but {room / 1e9:.3g} GB "
-        f"{what}: {way_out}"
-    )
-
-
-def _open(
-    directory: Path, fields: dict[str, _Field], slots: int, capacity: int
-) -> dict[str, mmap.mmap]:
-    """Create the files, or grow those that are there where they are too short, and map them.
-
-    Raises:
-        MerlError: the disk is full, the directory cannot be written, or it holds something else.
-            What was created is removed again, what was there is as it was.
-    """
-    header = directory / _HEADER
-    header_text = _header_text(fields, slots, capacity)
-    held = _held_slots(header, fields, slots, header_text)
-    paths = {name: directory / f"{name}.bin" for name in fields}
-    before = {paths[name]: held * field.bytes for name, field in fields.items()}
-    sizes = {paths[name]: max(slots, held) * field.bytes for name, field in fields.items()}
-    new_folders = [path for path in (directory, *directory.parents) if not path.exists()]
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        for path, size in sizes.items():
-            if not held:  # there without a header: left by a process that died while reserving
-                path.unlink(missing_ok=True)
-            reserve_file(path, size)
-        files = {name: _map(path, sizes[path]) for name, path in paths.items()}
-        if slots > held:
-            _write_text(header, header_text)
-    except BaseException as error:
-        with suppress(OSError):
-            _undo(before, new_folders)
-        if isinstance(error, OSError):
-            why = error.strerror or error
-            raise MerlError(f"cannot keep a replay in {directory}: {why}") from error
-        raise
-    return files
-
-
-def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:
-    """Give files the lengths that they had, remove those that had none, and the new folders."""
-    for path, length in lengths.items():
-        if not length:
-            path.unlink(missing_ok=True)
-        elif path.stat().st_size > length:
-            os.truncate(path, length)
-    for folder in new_folders:
-        folder.rmdir()
-
-
-def _held_slots(header: Path, fields: dict[str, _Field], slots: int, text: str) -> int:
-    """Slots of the ring that lies there, 0 if there is none; checks that it can be gone on with."""
-    if not header.exists():
-        return 0
-    directory, wanted = header.parent, json.loads(text)
-    try:
-        found = json.loads(header.read_text())
-        held = int(found["slots"])
-        same = all(found[name] == wanted[name] for name in ("format", "fields"))
-        whole = all(
-            (directory / f"{name}.bin").stat().st_size >= held * field.bytes
-            for name, field in fields.items()
-        )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise MerlError(f"{directory} holds a damaged replay: give another folder") from error
-    if not same:
-        raise MerlError(
-            f"{directory} holds a replay of other observations or actions: give another folder"
-        )
-    if not whole:
-        raise MerlError(f"{directory} holds a truncated replay: give another folder")
-    if slots > held and np.fromfile(directory / "moment.bin", "<i8", held).max() > held:
-        raise MerlError(
-            f"the replay in {directory} has wrapped and cannot grow: "
-            f"go on with --replay.capacity {found['capacity']}"
-        )
-    return held
-
-
-def _header_text(fields: dict[str, _Field], slots: int, capacity: int) -> str:
-    layout = {
-        name: {"dtype": field.dtype.str, "shape": field.shape} for name, field in fields.items()
-    }
-    header = {"format": _FORMAT, "capacity": capacity, "slots": slots, "fields": layout}
-    return json.dumps(header, indent=2) + "\n"
-
-
-def _write_text(path: Path, text: str) -> None:
-    """Replace the file as a whole, or not at all."""
-    temporary = path.with_suffix(".tmp")
-    try:
-        with temporary.open("w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _map(path: Path, size: int) -> mmap.mmap:
-    with path.open("r+b") as file:
-        return mmap.mmap(file.fileno(), size)

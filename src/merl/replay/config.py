@@ -1,0 +1,121 @@
+"""What the replay keeps, and whether there is room for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+
+from merl.core import MerlError
+from merl.replay.storage import fields_of
+from merl.resources import available_memory, existing_parent, free_disk
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """What the replay keeps and how it is sampled."""
+
+    capacity: int = 1_000_000
+    """Steps that are kept; a run that is shorter reserves only its own length."""
+    batch_size: int = 256
+    """Samples in one update."""
+    n_step: int = 3
+    """Rewards that are summed before the critic's estimate takes over."""
+    frame_stack: int = 3
+    """Pictures in a row that make one observation."""
+    discount: float = 0.99
+    """What a reward is worth one step later (gamma), from 0 to 1."""
+
+    def __post_init__(self) -> None:
+        for name in ("capacity", "batch_size", "n_step", "frame_stack"):
+            value = getattr(self, name)
+            if value < 1:
+                raise MerlError(
+                    f"replay.{name.replace('_', '-')} is {value}: give a whole number of at least 1"
+                )
+        if not 0 <= self.discount <= 1:
+            raise MerlError(f"replay.discount is {self.discount}: give a number from 0 to 1")
+        check_batch(self.batch_size, self.capacity)
+
+
+def replay_bytes(
+    config: ReplayConfig,
+    observation_space: gymnasium.spaces.Dict,
+    action_space: gymnasium.spaces.Box,
+    capacity: int | None = None,
+) -> int:
+    """Bytes that a replay takes, on disk or in memory; `capacity` counts steps."""
+    steps = config.capacity if capacity is None else capacity
+    slot = sum(field.bytes for field in fields_of(observation_space, action_space).values())
+    return slot * slots_for(steps, config.frame_stack)
+
+
+def check_fits(
+    config: ReplayConfig,
+    observation_space: gymnasium.spaces.Dict,
+    action_space: gymnasium.spaces.Box,
+    *,
+    directory: Path | None = None,
+    capacity: int | None = None,
+) -> None:
+    """Refuse a replay that the disk or the memory cannot hold, before anything is created.
+
+    Even a replay on disk has to fit into memory: one that does not reads the disk for every sample.
+
+    Raises:
+        MerlError: it does not fit: the message names the largest capacity that would. Or it is
+            smaller than one batch.
+    """
+    steps = config.capacity if capacity is None else capacity
+    check_batch(config.batch_size, steps)
+    room = {"of memory are available": available_memory()}
+    if directory is not None:
+        where = existing_parent(directory)
+        ours = sum(file.stat().st_size for file in directory.glob("*.bin"))  # if it is opened again
+        room[f"of disk are free in {where}"] = free_disk(where) + ours
+    what, least = min(room.items(), key=lambda item: item[1])
+    need = replay_bytes(config, observation_space, action_space, steps)
+    if need > least:
+        raise _too_large(config, observation_space, action_space, steps, what, least)
+
+
+def slots_for(capacity: int, frame_stack: int) -> int:
+    """Moments that hold `capacity` steps of episodes of a hundred steps or more.
+
+    An episode has one moment more than steps, and the oldest step needs its whole stack. Episodes
+    shorter than a hundred steps fill the slots before the capacity is reached. What is to spare
+    also lets a run go back to its last checkpoint after the ring has wrapped.
+    """
+    return capacity + capacity // 100 + frame_stack
+
+
+def check_batch(batch_size: int, capacity: int) -> None:
+    """Raise MerlError for a batch that the replay could never fill with different steps."""
+    if batch_size > capacity:
+        raise MerlError(
+            f"replay.batch-size {batch_size} is larger than the replay of {capacity} steps: "
+            f"give at most {capacity}, or more steps"
+        )
+
+
+def _too_large(
+    config: ReplayConfig,
+    observation_space: gymnasium.spaces.Dict,
+    action_space: gymnasium.spaces.Box,
+    capacity: int,
+    what: str,
+    room: int,
+) -> MerlError:
+    """The error that names the largest capacity for which there is room."""
+    need = replay_bytes(config, observation_space, action_space, capacity)
+    low, high = 0, capacity  # low fits, high does not
+    while high - low > 1:
+        middle = (low + high) // 2
+        fits = replay_bytes(config, observation_space, action_space, middle) <= room
+        low, high = (middle, high) if fits else (low, middle)
+    way_out = f"--replay.capacity {low} would fit" if low else "free some"
+    return MerlError(
+        f"a replay of {capacity:,} steps needs {need / 1e9:.3g} GB, but {room / 1e9:.3g} GB "
+        f"{what}: {way_out}"
+    )

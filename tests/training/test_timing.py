@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from merl.agents.merl import MERLConfig
+from merl.replay import ReplayConfig
+from merl.training.config import TrainConfig
+from merl.training.timing import Arithmetic, Timing, measure
+from toy import DotEnv
+
+FP32, BF16, BF16_ALL = Arithmetic("fp32", 1), Arithmetic("bf16", 1), Arithmetic("bf16", 4)
+CONFIG = TrainConfig(
+    "dot",
+    steps=1000,
+    seed_steps=200,
+    replay=ReplayConfig(batch_size=4),
+    agent=MERLConfig(latent_dim=8, hidden_dim=16),
+)
+
+
+def test_several_threads_must_pay() -> None:
+    assert Timing({FP32: 2.0, BF16: 1.0}, 0.1).best == BF16
+    assert Timing({FP32: 2.0, BF16: 1.0, BF16_ALL: 0.9}, 0.1).best == BF16
+    assert Timing({FP32: 2.0, BF16: 1.0, BF16_ALL: 0.7}, 0.1).best == BF16_ALL
+
+
+def test_the_time_of_a_run_counts_updates_steps_and_evaluations() -> None:
+    timing = Timing({FP32: 0.5}, 0.25)
+    config = dataclasses.replace(CONFIG, updates_per_step=0.5)
+    evaluated = 10 * 250  # one evaluation of ten episodes
+    assert timing.seconds(config) == 400 * 0.5 + (1000 + evaluated) * 0.25
+    assert timing.seconds(config, done=900) == 50 * 0.5 + (100 + evaluated) * 0.25
+    assert timing.seconds(dataclasses.replace(config, minutes=1.0)) == 60
+
+
+@pytest.mark.parametrize(
+    ("precision", "threads", "tried"),
+    [("auto", 1, {FP32, BF16}), ("fp32", 1, {FP32}), ("bf16", 1, {BF16})],
+)
+def test_only_what_is_left_open_is_timed(precision, threads, tried) -> None:  # type: ignore[no-untyped-def]
+    agent = dataclasses.replace(CONFIG.agent, precision=precision)
+    config = dataclasses.replace(CONFIG, agent=agent, threads=threads)
+    env = DotEnv()
+    env.length = 10_000
+    timing = measure(config, env, env.observation_space, torch.device("cpu"))
+    assert set(timing.update) == tried
+    assert all(seconds > 0 for seconds in timing.update.values())
+    assert timing.step > 0

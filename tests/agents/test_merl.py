@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig, make_merl, modalities
-from merl.core import MerlError
+from merl.core import Batch, MerlError
 
 SPACE = spaces.Dict(
     {
@@ -100,3 +100,28 @@ def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str
 def test_a_bad_number_is_named(name: str, value: float) -> None:
     with pytest.raises(MerlError, match=f"agent.{name.replace('_', '-')} must .* not {value}"):
         MERLConfig(**{name: value})
+
+
+def test_a_users_keys_may_be_called_anything() -> None:
+    """Torch's own dictionary of modules refuses dots and its own methods' names."""
+    space = spaces.Dict(
+        {
+            "type": spaces.Box(0, 255, (16, 16, 3), np.uint8),
+            "wrist camera": spaces.Box(0, 255, (20, 20, 1), np.uint8),
+            "arm.joints": spaces.Box(-1, 1, (3,), np.float32),
+            "keys": spaces.Box(-1, 1, (2,), np.float32),
+        }
+    )
+    agent = make(MERLConfig(latent_dim=8, hidden_dim=8), space)
+    observation = {
+        "type": torch.zeros((1, 3, 16, 16, 3), dtype=torch.uint8),
+        "wrist camera": torch.zeros((1, 3, 20, 20, 1), dtype=torch.uint8),
+        "arm.joints": torch.zeros((1, 3)),
+        "keys": torch.zeros((1, 2)),
+    }
+    assert agent.act(observation, explore=False).shape == (1, 9)
+    batch = Batch(
+        observation, torch.zeros((1, 9)), torch.zeros(1), torch.ones(1), dict(observation)
+    )
+    assert set(agent.draw(batch).shifts) == {"type", "wrist camera"}
+    agent.update(batch)

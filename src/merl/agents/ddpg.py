@@ -227,7 +227,7 @@ class DDPG:
         """The random numbers of the next update."""
         generator = self.learning
         size, pad = len(batch.action), self.networks.encoders.pad
-        keys = list(self.networks.encoders.images) if pad else []
+        keys = self.networks.encoders.image_keys if pad else ()
         shifts, next_shifts = (
             {key: draw_shifts(size, pad, generator) for key in keys} for _ in range(2)
         )

@@ -37,3 +37,5 @@ def _speed(task: str, size: int, name: RendererName) -> float | str:
             env.close()
     except MerlError as error:
         return str(error)
+    except Exception as error:  # whatever a driver does: that it does not work is the answer
+        return f"fails with {type(error).__name__}: {error}"

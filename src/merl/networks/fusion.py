@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from merl.core import MerlError
+from merl.networks.names import module_name
 
 Squash = Literal["tanh", "simplex"]
 SIMPLEX_GROUP = 8  # features that share one softmax, as in SimNorm (TD-MPC2)
@@ -44,17 +45,24 @@ class Fusion(nn.Module):
                 f"not {share}: use agent.latent-dim {SIMPLEX_GROUP * len(features)} or a multiple"
             )
         self.squash = squash
-        self.projections = nn.ModuleDict({key: nn.Linear(n, share) for key, n in features.items()})
+        self.modalities = tuple(features)
+        self.projections = nn.ModuleDict(
+            {module_name(key): nn.Linear(n, share) for key, n in features.items()}
+        )
         self.norms = nn.ModuleDict(
-            {key: nn.LayerNorm(share) if layer_norm else nn.Identity() for key in features}
+            {
+                module_name(key): nn.LayerNorm(share) if layer_norm else nn.Identity()
+                for key in features
+            }
         )
 
     def forward(self, encoded: Mapping[str, Tensor]) -> Tensor:
         """Encodings {key: (B, F_key)} to the latent (B, d), each entry in (-1, 1)."""
         latents = []
-        for key, projection in self.projections.items():
+        layers = zip(self.modalities, self.projections.values(), self.norms.values(), strict=True)
+        for key, projection, norm in layers:
             projected = projection(encoded[key]).to(projection.weight.dtype)
-            latents.append(self._squash(self.norms[key](projected)))
+            latents.append(self._squash(norm(projected)))
         return torch.cat(latents, dim=-1)  # (B, d)
 
     def _squash(self, latent: Tensor) -> Tensor:

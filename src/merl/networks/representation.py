@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from torch import Tensor, nn
 
 from merl.networks.augmentation import shift, to_input
+from merl.networks.names import module_name
 
 
 class Encoders(nn.Module):
@@ -18,6 +19,8 @@ class Encoders(nn.Module):
         pad: the random shift, in pixels to each side; 0 is none.
 
     Attributes:
+        image_keys: what is seen.
+        vector_keys: what is felt.
         features: the length of each modality's encoding, images first.
     """
 
@@ -25,8 +28,9 @@ class Encoders(nn.Module):
         self, images: Mapping[str, nn.Module], vectors: Mapping[str, nn.Module], pad: int
     ) -> None:
         super().__init__()
-        self.images = nn.ModuleDict(images)
-        self.vectors = nn.ModuleDict(vectors)
+        self.image_keys, self.vector_keys = tuple(images), tuple(vectors)
+        self.images = nn.ModuleDict({module_name(key): e for key, e in images.items()})
+        self.vectors = nn.ModuleDict({module_name(key): e for key, e in vectors.items()})
         self.pad = pad
         self.features = {key: int(e.features) for key, e in {**images, **vectors}.items()}  # type: ignore[arg-type]
 
@@ -44,10 +48,10 @@ class Encoders(nn.Module):
         """
         dtype = next(self.parameters(), observation[next(iter(observation))]).dtype
         encoded: dict[str, Tensor] = {}
-        for key, encoder in self.images.items():
+        for key, encoder in zip(self.image_keys, self.images.values(), strict=True):
             stack = observation[key]
             moved = shift(stack, shifts[key], self.pad) if shifts else stack
             encoded[key] = encoder(to_input(moved, dtype))
-        for key, encoder in self.vectors.items():
+        for key, encoder in zip(self.vector_keys, self.vectors.values(), strict=True):
             encoded[key] = encoder(observation[key])
         return encoded

@@ -32,8 +32,9 @@ def info(args: list[str]) -> int:
     parse(command, "merl info", args)
     console = Console()
     table = Table(show_header=False, box=None, padding=(0, 2))
-    for name, value in _rows():
-        table.add_row(name, value)
+    with console.status("measuring"):
+        for name, value in _rows():
+            table.add_row(name, value)
     console.print(table, highlight=False)
     return 0
 

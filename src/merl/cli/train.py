@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -74,7 +75,9 @@ class ResumeOptions:
 
 def _train(config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint] | None = None) -> int:
     console = Console()
-    with Trainer.prepare(config, new=resumed is None) as trainer:
+    with ExitStack() as stack:
+        with console.status("building the scene and timing this machine"):
+            trainer = stack.enter_context(Trainer.prepare(config, new=resumed is None))
         done = resumed[1].step if resumed else 0
         console.print(_outlook(trainer, what, done), highlight=False)
         with ConsoleView(console) as view:

@@ -23,6 +23,12 @@ Observation = Mapping[str, NDArray[Any]]
 float32 (n,). Frames are single; stacks are made by the actor and by replay."""
 
 
+CONFIG_FILE = "config.json"
+"""Where a run's folder keeps what was run."""
+METRICS_FILE = "metrics.csv"
+"""Where a run's folder keeps its numbers."""
+
+
 class MerlError(Exception):
     """A fault that the user can mend.
 

@@ -41,7 +41,8 @@ class DDPGConfig:
     noise_clip: float = 0.3
     """Bound of the noise in both updates; when acting it is not clipped."""
     target: Target = "heads"
-    """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too (DrQ-v2's)."""
+    """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too, as DrQ-v2's target
+    covers its trunk."""
     precision: Precision = "auto"
     """Arithmetic of the update: fp32, bf16 (weights, norms, targets and losses stay fp32), or auto,
     which times both once."""

@@ -10,10 +10,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.core import MerlError
+from merl.core import METRICS_FILE, MerlError
 from merl.statistics import bootstrap_interval
-
-METRICS_FILE = "metrics.csv"
 
 Array = NDArray[np.float64]
 Band = Literal["range", "bootstrap"]

@@ -14,9 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator, MaxNLocator, PercentFormatter
 
-from merl.core import MerlError
+from merl.core import CONFIG_FILE, METRICS_FILE, MerlError
 from merl.report.curves import (
-    METRICS_FILE,
     Aggregate,
     Array,
     Band,
@@ -402,7 +401,7 @@ def _title(run_dir: Run) -> str:
     """Task, preset and seed from the run's `config.json`, as far as it tells them."""
     path = Path(run_dir)
     try:
-        config: Any = json.loads((path / "config.json").read_text())
+        config: Any = json.loads((path / CONFIG_FILE).read_text())
     except (OSError, ValueError):
         config = {}
     config = config if isinstance(config, dict) else {}

@@ -20,9 +20,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from merl.core import MerlError
+from merl.core import METRICS_FILE, MerlError
 
-METRICS_FILE = "metrics.csv"
 TENSORBOARD_FOLDER = "tensorboard"
 
 _LOG = logging.getLogger(__name__)

@@ -32,10 +32,9 @@ import torch
 from gymnasium import spaces
 
 import merl
-from merl.core import MerlError
+from merl.core import CONFIG_FILE, MerlError
 from merl.training.config import TrainConfig
 
-CONFIG_FILE = "config.json"
 LOCK_FILE = "lock"
 FORMAT = 1
 PACKAGES = ("torch", "numpy", "gymnasium", "dm_control", "mujoco", "mujoco-warp", "warp-lang")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -179,7 +180,7 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code:
     assert process.returncode == code, err
     assert "Traceback" not in err
     assert f"merl resume {folder}" in out
-    saved = max(int(path.name) for path in (folder / "checkpoints").iterdir())
+    saved = max(int(p.name) for p in (folder / "checkpoints").iterdir() if p.name.isdigit())
     assert saved >= 500
     assert main(["resume", str(folder), "--steps", str(saved + 300)]) == 0
     steps = [int(row["step"]) for row in rows(folder)]
@@ -198,13 +199,22 @@ def test_one_process_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     finally:
         process.kill()
         process.wait()
-    last = max(int(path.name) for path in (folder / "checkpoints").iterdir() if path.suffix == "")
+    last = max(int(p.name) for p in (folder / "checkpoints").iterdir() if p.name.isdigit())
     assert main(["resume", str(folder), "--steps", str(last + 250)]) == 0
     record = json.loads((folder / "config.json").read_text())
     assert record["config"]["steps"] == last + 250
     assert [part["step"] for part in record["resumed"]] == [last]
     assert main(["resume", str(folder)]) == 0
     assert "is done" in capsys.readouterr().out
+
+    before = (folder / "config.json").read_bytes()
+    assert main(["resume", str(folder), "--steps", "300"]) == 2
+    assert "--steps 300 is less than" in capsys.readouterr().err
+    shutil.rmtree(folder / "replay")
+    assert main(["resume", str(folder), "--steps", "5000"]) == 2
+    assert "replay is gone" in capsys.readouterr().err
+    assert (folder / "config.json").read_bytes() == before
+    assert not (folder / "replay").exists()
 
 
 def test_minutes_end_a_run_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -283,9 +293,15 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-def test_cuda_where_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_cuda_where_there_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     assert main(["train", "reach_duplo", "--preset", "smoke", "--device", "cuda"]) == 2
-    assert "no CUDA device is found" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "no CUDA device is found" in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_existing_folder_is_left_alone(

@@ -80,7 +80,7 @@ class Account:
 
     @property
     def slots(self) -> int:
-        return self.config.capacity + self.config.capacity // 100 + self.config.frame_stack
+        return self.config.capacity + self.config.capacity // 200 + self.config.frame_stack
 
     def see(self, episode: int, t: int) -> None:
         self.moments.append((episode, t))

@@ -37,22 +37,30 @@ def resume(args: list[str]) -> int:
     """Go on with a run: merl resume RUN [--steps N] [--minutes N]."""
     options = parse(ResumeOptions, "merl resume", args)
     run = Run.open(options.run)
+    with run.lock():
+        start = Checkpoint.find(run.checkpoints)
+        config = _resumed_config(run, start, options)
+        evaluated = start.state()["progress"]["evaluated"]
+        if start.step == config.steps and evaluated == start.step:
+            steps = f"{start.step:,} of {config.steps:,} steps"
+            print(f"{run.path} is done: {steps}; --steps N takes it further")
+            return 0
+        if not run.replay.is_dir():
+            raise MerlError(f"{run.replay} is gone, and without its replay a run cannot go on")
+        return _train(config, f"run {run.path} goes on at step {start.step:,}", (run, start))
+
+
+def _resumed_config(run: Run, start: Checkpoint, options: ResumeOptions) -> TrainConfig:
+    """The run's config with what the user changes; on another machine what it decided is open."""
     config = dataclasses.replace(
-        run.config,
-        minutes=options.minutes,
-        steps=options.steps or run.config.steps,
-        device=options.device or run.config.device,
+        run.config, minutes=options.minutes, steps=options.steps or run.config.steps
     )
-    start = Checkpoint.find(run.checkpoints)
-    evaluated = start.state()["progress"]["evaluated"]
-    if start.step >= config.steps and evaluated >= start.step:
-        print(
-            f"{run.path} is done: {start.step:,} of {config.steps:,} steps; --steps N takes it "
-            "further"
-        )
-        return 0
-    run = dataclasses.replace(run, config=config)
-    return _train(config, f"run {run.path} goes on at step {start.step:,}", (run, start))
+    if start.step > config.steps:
+        raise MerlError(f"--steps {config.steps} is less than the {start.step:,} already taken")
+    if run.has_moved() or options.device not in (None, config.device):
+        agent = dataclasses.replace(config.agent, precision="auto")
+        config = dataclasses.replace(config, threads=None, agent=agent)
+    return dataclasses.replace(config, device=options.device or config.device)
 
 
 @dataclass(frozen=True)
@@ -84,7 +92,11 @@ def _train(config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint] | Non
             outcome = trainer.resume(*resumed, view) if resumed else trainer.start(view)
     folder = outcome.run.path
     if outcome.signal is not None:
-        console.print(f"stopped at step {outcome.progress.step:,} and saved: go on with")
+        stopped = f"stopped at step {outcome.progress.step:,}"
+        how = (
+            "and saved: go on" if outcome.saved else "and not saved: go on from the last checkpoint"
+        )
+        console.print(f"{stopped} {how} with")
         console.print(f"    {program()} resume {folder}", highlight=False, soft_wrap=True)
         return 128 + outcome.signal
     summarize(outcome, console)

@@ -81,13 +81,13 @@ def check_fits(
 
 
 def slots_for(capacity: int, frame_stack: int) -> int:
-    """Moments that hold `capacity` steps of episodes of a hundred steps or more.
+    """Moments that hold `capacity` steps of episodes of two hundred steps or more.
 
     An episode has one moment more than steps, and the oldest step needs its whole stack. Episodes
-    shorter than a hundred steps fill the slots before the capacity is reached. What is to spare
+    shorter than that fill the slots before the capacity is reached. What is to spare
     also lets a run go back to its last checkpoint after the ring has wrapped.
     """
-    return capacity + capacity // 100 + frame_stack
+    return capacity + capacity // 200 + frame_stack
 
 
 def check_batch(batch_size: int, capacity: int) -> None:

@@ -180,7 +180,7 @@ class Replay:
         """Go back to what `state_dict` said; what was written since then is forgotten.
 
         Of the moments held then, those overwritten since are gone: there are such only where the
-        ring has wrapped and its reserve (a hundredth of the capacity) is used up.
+        ring has wrapped and its reserve (half a hundredth of the capacity) is used up.
 
         Raises:
             MerlError: the ring does not hold what the state names.

@@ -56,7 +56,7 @@ class TrainConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the networks live; auto takes CUDA where it is there."""
     threads: int | None = None
-    """Processor threads of the update; if not set, one or all, whichever is faster here."""
+    """Processor threads of the update; if not set, one, or all where that is clearly faster."""
     random_steps: int = 2000
     """Steps of uniformly random actions at the start ("exploration steps" in Table 1)."""
     seed_steps: int = 4000

@@ -17,11 +17,12 @@ import itertools
 import json
 import os
 import platform
+import shutil
 import subprocess
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -77,7 +78,11 @@ class Run:
         except OSError as error:
             raise MerlError(f"the run's folder {path} cannot be made: {error.strerror}") from None
         run = cls(path, config)
-        run._write(record)
+        try:
+            run._write(record)
+        except MerlError:
+            shutil.rmtree(path, ignore_errors=True)
+            raise
         return run
 
     @classmethod
@@ -114,6 +119,12 @@ class Run:
         )
         self._write(record)
 
+    def has_moved(self) -> bool:
+        """Whether it was trained last on another machine than this one."""
+        record = json.loads((self.path / CONFIG_FILE).read_text())
+        last = record.get("resumed", [record])[-1]
+        return bool(last["machine"] != machine())
+
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Keep every other process from training in this folder; the lock dies with the process.
@@ -121,14 +132,17 @@ class Run:
         Raises:
             MerlError: another process trains here.
         """
-        with (self.path / LOCK_FILE).open("a+") as file:
+        path = self.path / LOCK_FILE
+        with ExitStack() as stack:
             try:
+                file = stack.enter_context(path.open("a+"))
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                file.seek(0)
                 raise MerlError(
-                    f"process {file.read().strip()} is training in {self.path}: stop it first"
+                    f"process {path.read_text().strip()} is training in {self.path}: stop it first"
                 ) from None
+            except OSError as error:
+                raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
             file.truncate(0)
             file.write(str(os.getpid()))
             file.flush()

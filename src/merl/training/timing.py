@@ -60,7 +60,7 @@ class Timing:
 
     def seconds(self, config: TrainConfig, done: int = 0) -> float:
         """The time that a run will take from step `done` on, evaluation included."""
-        steps = config.steps - done
+        steps = max(0, config.steps - done)
         updates = (config.steps - max(done, config.seed_steps)) * config.updates_per_step
         evaluations = max(1, steps // config.eval.every) * config.eval.episodes
         length = 250  # steps of an episode, near enough for an estimate
@@ -82,7 +82,7 @@ def measure(
         ("fp32", "bf16") if asked == "auto" else (asked,)
     )
     assert isinstance(env.action_space, spaces.Box)
-    batch = _random_batch(config, space, env.action_space).to(device)
+    batch = _random_batch(config, space, env.action_space)  # as from replay: not on the device yet
     update: dict[Arithmetic, float] = {}
 
     def attempt(arithmetic: Arithmetic) -> DDPG:
@@ -126,7 +126,7 @@ def _time_update(agent: DDPG, batch: Batch) -> float:
 
 
 def _time_acting(agent: DDPG, batch: Batch) -> float:
-    one = {key: value[:1] for key, value in batch.observation.items()}
+    one = {key: value[:1].to(agent.device) for key, value in batch.observation.items()}
 
     def act() -> None:
         agent.act(one, explore=True).cpu()

@@ -63,12 +63,14 @@ class Outcome:
         progress: where it stands.
         evaluation: the last one, if there was any.
         signal: what interrupted it; None if it ran to its end.
+        saved: whether its last checkpoint is on the disk.
     """
 
     run: Run
     progress: Progress
     evaluation: Evaluation | None
     signal: int | None
+    saved: bool
 
 
 class Trainer:
@@ -152,22 +154,20 @@ class Trainer:
         """Begin a new run; if it fails before its first step, its folder is removed again."""
         run = Run.create(self.config, self.space, self.action_space)
         try:
-            return self._run(run, None, view)
+            with run.lock():
+                return self._run(run, None, view)
         except BaseException:
             if self.progress.step == 0:
                 shutil.rmtree(run.path, ignore_errors=True)
             raise
 
     def resume(self, run: Run, start: Checkpoint, view: View) -> Outcome:
-        """Go on from a checkpoint of the run."""
-        return self._run(run, start, view)
+        """Go on from a checkpoint of the run, whose lock the caller holds."""
+        return self._run(dataclasses.replace(run, config=self.config), start, view)
 
     def _run(self, run: Run, start: Checkpoint | None, view: View) -> Outcome:
         with ExitStack() as stack:
-            stack.enter_context(run.lock())
             interrupt = stack.enter_context(Interrupt().listening())
-            if start is not None:
-                run.record_resumption(start.step)
             replay = Replay(
                 self.config.replay,
                 self.space,
@@ -179,6 +179,7 @@ class Trainer:
             stretch = _Stretch(self, run, replay, metrics, view, interrupt)
             if start is not None:
                 stretch.restore(start)
+                run.record_resumption(start.step)
             return stretch.train()
 
 
@@ -228,8 +229,8 @@ class _Stretch:
                 break
         if self.interrupt.number is None and progress.evaluated < progress.step:
             self._evaluate(last=True)
-        self._save()
-        return Outcome(self.run, progress, self.evaluation, self.interrupt.number)
+        saved = self._save()
+        return Outcome(self.run, progress, self.evaluation, self.interrupt.number, saved)
 
     def restore(self, start: Checkpoint) -> None:
         """Stand where the checkpoint was taken."""
@@ -296,7 +297,8 @@ class _Stretch:
             raise _Interrupted
         self.view.evaluating(episode, self.config.eval.episodes)
 
-    def _save(self) -> None:
+    def _save(self) -> bool:
+        """Write a checkpoint; that it could not be written is told, and does not stop the run."""
         trainer, progress = self.trainer, self.trainer.progress
         fresh = self.evaluation is not None and progress.evaluated == progress.step
         state = {
@@ -318,11 +320,14 @@ class _Stretch:
                 score=self.evaluation.returns.mean if fresh and self.evaluation else None,
                 keep=self.config.keep,
             )
-            self.view.saved(progress.step)
         except OSError as error:
             reason = error.strerror or error
             self.view.warn(f"the checkpoint at step {progress.step} was not written: {reason}")
-        self._saved = time.perf_counter()
+            return False
+        finally:
+            self._saved = time.perf_counter()
+        self.view.saved(progress.step)
+        return True
 
 
 def choose_device(name: str) -> torch.device:

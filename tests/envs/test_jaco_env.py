@@ -80,11 +80,11 @@ def test_a_seed_alone_decides_the_start(blind):
 
 def test_episodes_differ_and_can_be_taken_up_again(blind):
     blind.reset(seed=1)
-    state = blind.get_random_state()
+    state = blind.np_random.bit_generator.state
     second, third = episode(blind), episode(blind)
     assert not same(second[0], third[0])
     another = make_env("reach_duplo", renderer="warp", observations=("proprio", "state"))
-    another.set_random_state(state)
+    another.np_random.bit_generator.state = state
     assert all(same(a, b) for a, b in zip(second, episode(another), strict=True))
     assert all(same(a, b) for a, b in zip(third, episode(another), strict=True))
     another.close()

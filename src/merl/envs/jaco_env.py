@@ -28,6 +28,9 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     `success` (1.0 if the task is solved at this moment, else 0.0), `distance` (what success is
     measured by, m) and `reward_terms` (by name; they sum to the reward, which is in [0, 1]).
 
+    Its only random state is Gymnasium's `np_random`: where that is set back between two episodes,
+    the same episodes follow.
+
     Attributes:
         task: what is to be solved.
         config: how it is seen.
@@ -115,14 +118,6 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._physics is not None:
             self._physics.free()
         self._physics, self._steps_left = None, 0
-
-    def get_random_state(self) -> dict[str, Any]:
-        """What the episodes to come depend on, as plain types; take it between episodes."""
-        return dict(self.np_random.bit_generator.state)
-
-    def set_random_state(self, state: dict[str, Any]) -> None:
-        """Take back what `get_random_state` gave: `reset()` without a seed starts from there."""
-        self.np_random.bit_generator.state = state
 
     def _velocities(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Target velocities of the joints, (9,), rad/s."""

@@ -67,9 +67,10 @@ def to_input(images: Tensor, dtype: torch.dtype) -> Tensor:
     The memory is in channels-last order, which is what convolutions are fastest with.
     """
     batch, stack, height, width, channels = images.shape
-    pixels = torch.empty((batch, height, width, stack, channels), dtype=dtype, device=images.device)
+    interleaved = images.new_empty((batch, height, width, stack, channels))
     # A copy per channel runs along whole images; one permuted copy would run along three bytes.
     for frame in range(stack):
         for channel in range(channels):
-            pixels[..., frame, channel] = images[:, frame, ..., channel]
-    return pixels.flatten(3).permute(0, 3, 1, 2).mul_(1.0 / 255.0).sub_(0.5)
+            interleaved[..., frame, channel] = images[:, frame, ..., channel]
+    pixels = interleaved.flatten(3).to(dtype)
+    return pixels.mul_(1.0 / 255.0).sub_(0.5).permute(0, 3, 1, 2)

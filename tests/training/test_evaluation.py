@@ -43,6 +43,8 @@ def test_success_at_the_end_and_at_any_time_are_told_apart() -> None:
     assert result.success_any is not None
     assert result.success_end.mean == 0.0
     assert 0.0 < result.success_any.mean < 1.0
+    assert result.success_share is not None
+    assert 0.0 < result.success_share.mean < result.success_any.mean
     metrics = result.metrics()
     assert metrics["success_end_low"] <= metrics["success_end"] <= metrics["success_end_high"]
     assert metrics["episodes"] == 20

@@ -133,6 +133,7 @@ def test_an_episode_sums_what_its_steps_bring() -> None:
         "length": 3.0,
         "success_end": 0.0,
         "success_any": 1.0,
+        "success_share": 1 / 3,
         "reward/near": 0.75,
     }
     silent = Episode()

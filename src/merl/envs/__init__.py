@@ -5,10 +5,8 @@ Importing this is cheap; the simulator is loaded when the first environment is m
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
-from merl.core import MerlError
 from merl.envs.config import EnvConfig
 
 if TYPE_CHECKING:
@@ -23,7 +21,7 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
     Args:
         task: a name of `merl.tasks.TASKS`.
         render_mode: `rgb_array` for `env.render()` to return pictures.
-        **config: the fields of `EnvConfig`: `renderer`, `image_size`, ...
+        **config: the fields of `EnvConfig`: `renderer`, `image_size`, `occluded`, ...
 
     Returns:
         The environment, not yet reset; see `merl.envs.jaco_env.JacoEnv`.
@@ -34,10 +32,6 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
     """
     settings = EnvConfig(**config)
     from merl.envs.jaco_env import JacoEnv
-    from merl.tasks import TASKS
+    from merl.tasks import make_task
 
-    if task not in TASKS:
-        close = get_close_matches(task, TASKS, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"choose from {', '.join(TASKS)}"
-        raise MerlError(f"task {task!r} is unknown: {hint}")
-    return JacoEnv(TASKS[task](), settings, render_mode)
+    return JacoEnv(make_task(task, occluded=settings.occluded), settings, render_mode)

@@ -31,6 +31,10 @@ class EnvConfig:
     observations: tuple[str, ...] = ("image", "proprio")
     """What an observation holds: any of `image`, `proprio`, `state`. The rest is not computed."""
 
+    occluded: bool = False
+    """Put a disc between camera and object, for `move_box` and `lift_box`: what the camera does not
+    see, the joints have to tell."""
+
     render_size: int = 480
     """Height and width of the pictures for people (videos), in pixels; at least 16."""
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 from gymnasium.envs.registration import register as register_with_gymnasium
 from gymnasium.envs.registration import registry
 
-ENV_IDS = {"reach_duplo": "merl/ReachDuplo-v0"}
+ENV_IDS = {
+    "reach_duplo": "merl/ReachDuplo-v0",
+    "move_box": "merl/MoveBox-v0",
+    "lift_box": "merl/LiftBox-v0",
+}
 """Gymnasium's id of each task."""
 
 

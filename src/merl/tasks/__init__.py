@@ -3,14 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from difflib import get_close_matches
+from functools import partial
 
+from merl.core import MerlError
 from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
 
 # isort: split
 from merl.tasks.jaco import JacoTask
+from merl.tasks.lift_box import LiftBox
+from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
 
-__all__ = ["TASKS", "JacoTask", "ReachDuplo", "check_versions"]
+__all__ = [
+    "OCCLUDED",
+    "TASKS",
+    "JacoTask",
+    "LiftBox",
+    "MoveBox",
+    "ReachDuplo",
+    "check_versions",
+    "make_task",
+]
 
-TASKS: dict[str, Callable[[], JacoTask]] = {"reach_duplo": ReachDuplo}
+TASKS: dict[str, Callable[[], JacoTask]] = {
+    "reach_duplo": ReachDuplo,
+    "move_box": MoveBox,
+    "lift_box": LiftBox,
+}
 """Every task by its name."""
+
+OCCLUDED: dict[str, Callable[[], JacoTask]] = {
+    "move_box": partial(MoveBox, occluded=True),
+    "lift_box": partial(LiftBox, occluded=True),
+}
+"""The tasks that can also be had with a disc between camera and object."""
+
+
+def make_task(name: str, *, occluded: bool = False) -> JacoTask:
+    """A task by its name.
+
+    Args:
+        name: a key of `TASKS`.
+        occluded: with a disc between camera and object.
+
+    Raises:
+        MerlError: there is no such task, or it has no occluded form.
+    """
+    if name not in TASKS:
+        close = get_close_matches(name, TASKS, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"choose from {', '.join(TASKS)}"
+        raise MerlError(f"task {name!r} is unknown: {hint}")
+    if occluded and name not in OCCLUDED:
+        raise MerlError(f"{name} has no occluded form: choose from {', '.join(OCCLUDED)}")
+    return (OCCLUDED if occluded else TASKS)[name]()

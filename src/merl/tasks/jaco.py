@@ -35,21 +35,24 @@ PROPRIO_SIZES: dict[ProprioSet, int] = {"paper": 24, "full": 42}
 _POSE_AND_VELOCITY = ("position", "orientation", "linear_velocity", "angular_velocity")
 
 Float32 = NDArray[np.float32]
+Position = tuple[float, float, float]
+"""x, y, z, m."""
 
 
 class Box(NamedTuple):
     """An axis-aligned box from which a position is drawn uniformly."""
 
-    lower: tuple[float, float, float]
+    lower: Position
     """Least x, y, z, m."""
-    upper: tuple[float, float, float]
+    upper: Position
     """Greatest x, y, z, m."""
 
 
 HAND_SPAWN = Box((-0.1, -0.1, 0.2), (0.1, 0.1, 0.4))
 """Where the tool centre point starts (dm_control `manipulation.reach`)."""
 OBJECT_SPAWN = Box((-0.1, -0.1, 0.001), (0.1, 0.1, 0.001))
-"""Where the object is let go, 1 mm above the floor, before it settles (the same)."""
+"""Where the lower face of the object is let go, 1 mm above the floor, before it settles (the same,
+whose objects have their origin there)."""
 
 
 class JacoTask(composer.Task):  # type: ignore[misc]
@@ -58,16 +61,25 @@ class JacoTask(composer.Task):  # type: ignore[misc]
     In every episode the hand starts at random in `HAND_SPAWN`, pointing down with its fingers
     closed by a random amount, and the object lies at random in `OBJECT_SPAWN`.
 
+    Args:
+        prop: the object.
+        prop_height: of its origin above its lower face, m.
+        target: where the object is to be brought, m; None where the object itself is the target.
+
     Attributes:
         arm: the Jaco arm, six velocity-controlled joints.
         hand: the Jaco hand, three velocity-controlled fingers.
         prop: the object.
+        target: where the object is to be brought, (3,), m, or None.
         success_distance: the task is solved when `distance` is at most this, m.
     """
 
     success_distance: float
 
-    def __init__(self, prop: composer.Entity) -> None:
+    def __init__(
+        self, prop: composer.Entity, prop_height: float = 0.0, target: Position | None = None
+    ) -> None:
+        self.target = None if target is None else np.array(target)
         self._arena = arenas.Standard()
         self.arm = kinova.JacoArm()
         self.hand = kinova.JacoHand(use_pinch_site_as_tcp=True)
@@ -85,7 +97,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         )
         self._place_prop = initializers.PropPlacer(
             props=[prop],
-            position=distributions.Uniform(*OBJECT_SPAWN),
+            position=distributions.Uniform(*(np.array(OBJECT_SPAWN) + (0.0, 0.0, prop_height))),
             quaternion=workspaces.uniform_z_rotation,
             settle_physics=True,
         )
@@ -126,6 +138,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         self._arm_axes = np.array(arm.axis)
         self._torques = _sensor_slice(physics, self.arm.joint_torque_sensors)
         self._tcp = int(physics.bind(self.hand.tool_center_point).element_id)
+        self._wrist = int(physics.bind(self.hand.hand_geom[0]).element_id)
         self._prop_body = int(physics.bind(self._prop_frame).element_id)
         sensors = [self.prop.mjcf_model.find("sensor", name) for name in _POSE_AND_VELOCITY]
         self._prop_sensors = _sensor_slice(physics, sensors)
@@ -151,6 +164,20 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         """From the tool centre point to the object, m."""
         offset = self.tool_center_point(physics) - self.prop_position(physics)
         return float(np.linalg.norm(offset))
+
+    def goal_distance(self, physics: mjcf.Physics) -> float:
+        """From the object to its target, m; only where there is one."""
+        assert self.target is not None
+        return float(np.linalg.norm(self.prop_position(physics) - self.target))
+
+    def tilt_cosine(self, physics: mjcf.Physics) -> float:
+        """How much the hand points down, in [-1, 1]: 1 is straight down.
+
+        The hand's axis leads from the centre of its largest part to the tool centre point; it is
+        0.9927 where an episode starts.
+        """
+        axis = self.tool_center_point(physics) - physics.data.geom_xpos[self._wrist]
+        return float(-axis[2] / np.linalg.norm(axis))
 
     def proprio(self, physics: mjcf.Physics, which: ProprioSet = "paper") -> Float32:
         """What the robot feels of itself.
@@ -187,12 +214,14 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         """All that matters, for agents without a camera.
 
         Returns:
-            float32 (55,): `full` proprioception (42), and the object's position in m (3),
+            float32 (55,) or (58,): `full` proprioception (42), the object's position in m (3),
             orientation as a unit quaternion (4), and linear and angular velocity in m/s and
-            rad/s (6).
+            rad/s (6), and where there is one the target's position in m (3).
         """
-        prop = physics.data.sensordata[self._prop_sensors].astype(np.float32)
-        return np.concatenate([self.proprio(physics, "full"), prop])
+        parts = [self.proprio(physics, "full"), physics.data.sensordata[self._prop_sensors]]
+        if self.target is not None:
+            parts.append(self.target)
+        return np.concatenate(parts, dtype=np.float32, casting="same_kind")
 
     @abstractmethod
     def distance(self, physics: mjcf.Physics) -> float:

@@ -150,11 +150,12 @@ class ConsoleView:
 
 def describe(evaluation: Evaluation) -> str:
     """An evaluation in one line, with its intervals."""
-    returns, end, some = evaluation.returns, evaluation.success_end, evaluation.success_any
+    returns, end = evaluation.returns, evaluation.success_end
     line = f"return {returns.mean:.1f} [{returns.low:.1f}, {returns.high:.1f}]"
-    if end is not None and some is not None:
+    if end is not None and evaluation.success_any and evaluation.success_share:
         line += (
             f", success {end.mean:.0%} [{end.low:.0%}, {end.high:.0%}] at the end, "
-            f"{some.mean:.0%} at any time"
+            f"{evaluation.success_any.mean:.0%} at any time, "
+            f"{evaluation.success_share.mean:.0%} of the steps"
         )
     return f"{line} ({len(evaluation.episodes)} episodes)"

@@ -115,12 +115,14 @@ class Evaluation:
         success_end: the rate of success at the last step, with Wilson's interval; None where the
             environment does not say.
         success_any: likewise, at any step.
+        success_share: the mean share of steps that are a success, with its bootstrap interval.
     """
 
     episodes: tuple[Episode, ...]
     returns: Interval
     success_end: Interval | None
     success_any: Interval | None
+    success_share: Interval | None
 
     def metrics(self) -> dict[str, float]:
         """By name, as they stand in `metrics.csv` (behind `eval/`)."""
@@ -129,6 +131,7 @@ class Evaluation:
             "return": self.returns,
             "success_end": self.success_end,
             "success_any": self.success_any,
+            "success_share": self.success_share,
         }
         for name, interval in named.items():
             if interval is not None:
@@ -181,13 +184,14 @@ def evaluate(
 
 def summarize(episodes: list[Episode]) -> Evaluation:
     """Means and intervals over episodes."""
-    ends = [e.success for e in episodes if e.success is not None]
-    anys = [e.success_any for e in episodes if e.success_any is not None]
+    told = [e for e in episodes if e.success is not None]  # the others do not speak of success
+    count = len(told)
     return Evaluation(
         tuple(episodes),
         bootstrap_interval([e.total_reward for e in episodes]),
-        wilson_interval(sum(ends), len(ends)) if ends else None,
-        wilson_interval(sum(anys), len(anys)) if anys else None,
+        wilson_interval(sum(bool(e.success) for e in told), count) if told else None,
+        wilson_interval(sum(e.successes > 0 for e in told), count) if told else None,
+        bootstrap_interval([e.successes / e.length for e in told]) if told else None,
     )
 
 

@@ -54,14 +54,14 @@ class Episode:
         total_reward: the undiscounted return.
         length: steps.
         success: whether the last step was a success; None where the environment does not say.
-        success_any: whether any step was one.
+        successes: how many steps were one.
         terms: each term of the reward, summed.
     """
 
     total_reward: float = 0.0
     length: int = 0
     success: bool | None = None
-    success_any: bool | None = None
+    successes: int = 0
     terms: dict[str, float] = field(default_factory=dict)
 
     def add(self, reward: float, info: Mapping[str, Any]) -> None:
@@ -70,13 +70,17 @@ class Episode:
         self.length += 1
         if "success" in info:
             self.success = bool(info["success"])
-            self.success_any = bool(self.success_any) or self.success
+            self.successes += self.success
         for name, value in info.get("reward_terms", {}).items():
             self.terms[name] = self.terms.get(name, 0.0) + float(value)
 
     def metrics(self) -> dict[str, float]:
         """Its numbers by name."""
         values = {"return": self.total_reward, "length": float(self.length)}
-        if self.success is not None and self.success_any is not None:
-            values |= {"success_end": float(self.success), "success_any": float(self.success_any)}
+        if self.success is not None:
+            values |= {
+                "success_end": float(self.success),
+                "success_any": float(self.successes > 0),
+                "success_share": self.successes / self.length,
+            }
         return values | {f"reward/{name}": value for name, value in self.terms.items()}

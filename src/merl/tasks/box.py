@@ -9,6 +9,9 @@ BOX_HALF_SIZE = 0.025
 """Half the length of an edge, m: also the height at which the box's centre rests."""
 BOX_MASS = 0.1
 """kg."""
+DISC_CENTER = (0.0, -0.06)
+"""Middle of the disc, x and y, m: nearer to the camera than the middle of the workspace, so that
+from where the camera stands it hides most of what lies there (docs/tasks.md)."""
 DISC_HEIGHT = (0.135, 0.150)
 """Lower and upper face of the disc, m above the floor."""
 _RED = (1.0, 0.0, 0.0, 1.0)
@@ -22,7 +25,7 @@ def make_box() -> composer.Entity:
 
 
 def add_disc(arena: composer.Arena, radius: float) -> None:
-    """Fix a solid disc over the middle of the workspace.
+    """Fix a solid disc between the camera and the middle of the workspace.
 
     Args:
         arena: the scene.
@@ -33,7 +36,7 @@ def add_disc(arena: composer.Arena, radius: float) -> None:
         "geom",
         name="disc",
         type="cylinder",
-        pos=(0.0, 0.0, (lower + upper) / 2),
+        pos=(*DISC_CENTER, (lower + upper) / 2),
         size=(radius, (upper - lower) / 2),
         rgba=_GREY,
     )

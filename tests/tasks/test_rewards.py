@@ -1,8 +1,13 @@
-"""Eq. 3 at points computed by hand."""
+"""Eqs. 3 to 5 at points computed by hand, at both sides of every gate, and within their bounds."""
 
+import itertools
+
+import numpy as np
 import pytest
 
 from merl.tasks import rewards
+
+NEAR, FAR = 0.0499, 0.0501  # on either side of epsilon_reaching
 
 
 @pytest.mark.parametrize(
@@ -21,3 +26,78 @@ def test_reach(distance: float, expected: float) -> None:
     terms = rewards.reach(distance)
     assert list(terms) == ["reaching"]
     assert terms["reaching"] == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("hand", "goal", "reaching", "pushing"),
+    [
+        (0.0, 0.0, 0.5, 0.5),
+        (NEAR, 0.01, 0.5, 0.5),
+        (NEAR, 0.0100001, 0.5, 0.5),
+        (NEAR, 0.06, 0.5, 0.05),  # the margin's end
+        (NEAR, 0.035, 0.5, 0.5 / (1 + 9 * 0.25)),  # a long tail: 1 / (1 + 9 share^2)
+        (NEAR, 0.21, 0.5, 0.5 / (1 + 9 * 16)),
+        (0.05, 0.0, 0.5, 0.0),  # the gate is open strictly below epsilon_reaching
+        (FAR, 0.0, 0.5, 0.0),
+        (0.1, 0.0, 0.05, 0.0),  # a box that was thrown to its target pays nothing
+    ],
+)
+def test_move(hand: float, goal: float, reaching: float, pushing: float) -> None:
+    terms = rewards.move(hand, goal)
+    assert list(terms) == ["reaching", "pushing"]
+    assert terms["reaching"] == pytest.approx(reaching, abs=1e-4)
+    assert terms["pushing"] == pytest.approx(pushing, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("hand", "cosine", "height", "goal", "expected"),
+    [
+        # reaching, vertical, floating, lifting; each a quarter, the target at 0.18
+        (0.0, 1.0, 0.18, 0.0, (1.0, 1.0, 1.0, 1.0)),
+        (NEAR, 0.99, 0.0351, 0.01, (1.0, 1.0, 0.195, 1.0)),
+        (NEAR, 0.99, 0.035, 0.0, (1.0, 1.0, 0.0350 / 0.18, 0.0)),  # not above: not off the floor
+        (NEAR, 1.0, 0.025, 0.155, (1.0, 1.0, 0.025 / 0.18, 0.0)),  # hand at the box on the floor
+        (FAR, 1.0, 0.18, 0.0, (1.0, 1.0, 0.0, 0.0)),  # a box that flies by itself
+        (0.3, 0.0, 0.025, 0.2, (0.0, 0.1, 0.0, 0.0)),  # one margin below: 0.1
+        (0.3, 0.495, 0.025, 0.2, (0.0, 0.1**0.25, 0.0, 0.0)),
+        (0.3, -1.0, 0.025, 0.2, (0.0, 0.1 ** (1.99 / 0.99) ** 2, 0.0, 0.0)),
+        (NEAR, 1.0, 0.36, 0.18, (1.0, 1.0, 1.0, 1 / (1 + 9 * (0.17 / 0.05) ** 2))),  # too high
+        (NEAR, 1.0, -0.01, 0.2, (1.0, 1.0, 0.0, 0.0)),
+    ],
+)
+def test_lift(
+    hand: float, cosine: float, height: float, goal: float, expected: tuple[float, ...]
+) -> None:
+    terms = rewards.lift(hand, cosine, height, 0.18, goal)
+    assert list(terms) == ["reaching", "vertical", "floating", "lifting"]
+    assert np.array(list(terms.values())) == pytest.approx(np.array(expected) / 4, abs=1e-4)
+
+
+def test_a_tilted_hand_may_count_as_vertical() -> None:
+    upright = rewards.lift(0.3, 0.4, 0.025, 0.22, 0.2, vertical_cosine=0.4)["vertical"]
+    assert upright == 0.25
+    assert rewards.lift(0.3, 0.39, 0.025, 0.22, 0.2, vertical_cosine=0.4)["vertical"] < 0.25
+    assert rewards.lift(0.3, 0.4, 0.025, 0.22, 0.2)["vertical"] < 0.25
+
+
+def test_every_term_and_their_sum_stay_within_bounds() -> None:
+    draw = np.random.default_rng(0)
+    combinations: dict[tuple[bool, bool, bool], int] = {}
+    gates = list(itertools.product((False, True), repeat=3))
+    for at_object, off_floor, at_goal in gates:
+        for _ in range(1000):
+            hand = draw.uniform(0, 0.05) if at_object else draw.uniform(0.05, 0.15)
+            height = draw.uniform(0.0351, 0.3) if off_floor else draw.uniform(-0.001, 0.035)
+            goal = draw.uniform(0, 0.01) if at_goal else draw.uniform(0.01, 0.15)
+            cosine = np.cos(np.radians(draw.uniform(0, 180)))
+            lifted = rewards.lift(hand, cosine, height, 0.18, goal)
+            moved = rewards.move(hand, goal)
+            for terms in (rewards.reach(hand), moved, lifted):
+                assert all(0 <= term <= 1 / len(terms) + 1e-12 for term in terms.values())
+                assert 0 <= sum(terms.values()) <= 1 + 1e-12
+            assert (lifted["floating"] > 0) == (at_object and height > 0)
+            assert (lifted["lifting"] > 0) == (at_object and off_floor)
+            assert (moved["pushing"] > 0) == at_object
+            reached = (at_object, off_floor, at_goal)
+            combinations[reached] = combinations.get(reached, 0) + 1
+    assert min(combinations[gate] for gate in gates) == 1000

@@ -22,6 +22,7 @@ COMMANDS = {
     "train": ("merl.cli.train", "train", "train an agent"),
     "resume": ("merl.cli.train", "resume", "go on with a run"),
     "evaluate": ("merl.cli.evaluate", "evaluate", "run a trained policy, film it"),
+    "tasks": ("merl.cli.tasks", "tasks", "what there is to learn"),
     "info": ("merl.cli.info", "info", "what this machine offers"),
     "bench": ("merl.cli.bench", "bench", "time merl against what there was before"),
 }

@@ -71,9 +71,11 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         hand: the Jaco hand, three velocity-controlled fingers.
         prop: the object.
         target: where the object is to be brought, (3,), m, or None.
+        term_names: the names of the reward's terms.
         success_distance: the task is solved when `distance` is at most this, m.
     """
 
+    term_names: tuple[str, ...]
     success_distance: float
 
     def __init__(
@@ -97,7 +99,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         )
         self._place_prop = initializers.PropPlacer(
             props=[prop],
-            position=distributions.Uniform(*(np.array(OBJECT_SPAWN) + (0.0, 0.0, prop_height))),
+            position=distributions.Uniform(*(np.array(OBJECT_SPAWN) + [0.0, 0.0, prop_height])),
             quaternion=workspaces.uniform_z_rotation,
             settle_physics=True,
         )

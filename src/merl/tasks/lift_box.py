@@ -25,6 +25,7 @@ class LiftBox(JacoTask):
         occluded: put a disc between camera and box.
     """
 
+    term_names = ("reaching", "vertical", "floating", "lifting")
     success_distance = rewards.GOAL_DISTANCE
 
     def __init__(self, occluded: bool = False) -> None:

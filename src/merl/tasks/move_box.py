@@ -26,6 +26,7 @@ class MoveBox(JacoTask):
         occluded: put a disc between camera and box.
     """
 
+    term_names = ("reaching", "pushing")
     success_distance = rewards.GOAL_DISTANCE
 
     def __init__(self, occluded: bool = False) -> None:

@@ -12,6 +12,7 @@ from merl.tasks.jaco import JacoTask
 class ReachDuplo(JacoTask):
     """Bring the hand to within 5 cm of a 2x4 Duplo brick (dm_control's `reach_duplo`)."""
 
+    term_names = ("reaching",)
     success_distance = rewards.REACHING_DISTANCE
 
     def __init__(self) -> None:

@@ -1,0 +1,97 @@
+"""merl tasks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
+
+from merl.cli.parsing import parse
+from merl.core import MerlError
+from merl.envs import make_env
+from merl.envs.registration import ENV_IDS
+from merl.tasks import OCCLUDED, TASKS
+
+PICTURE_WIDTH = 40  # characters
+PICTURE_SIZE = 480  # pixels, of the files
+START = 3
+"""The seed of the start that is shown: arm and object are both in view."""
+
+
+def tasks(args: list[str]) -> int:
+    """What there is to learn, with a picture of each task."""
+
+    def command(pictures: Path | None = None) -> Path | None:
+        """List the tasks that come with merl, with a picture of each.
+
+        Args:
+            pictures: Also write the pictures into this folder, as PNG files.
+        """
+        return pictures
+
+    folder = parse(command, "merl tasks", args)
+    console = Console()
+    for name in TASKS:
+        picture = _picture(name)
+        console.print(_entry(name, picture, console), highlight=False)
+        if folder is not None:
+            path = folder / f"{name}.png"
+            _write(path, picture)
+            console.print(f"picture: {path}\n", highlight=False, soft_wrap=True)
+    return 0
+
+
+def _entry(name: str, picture: NDArray[np.uint8], console: Console) -> Table:
+    about = (TASKS[name].__doc__ or "").strip().splitlines()[0]
+    terms = TASKS[name]().term_names
+    lines = [
+        Text(name, style="bold"),
+        Text(about),
+        Text(f"reward: {' + '.join(terms)}, in [0, 1]; 250 steps of 0.04 s"),
+        Text(f"gymnasium.make('merl:{ENV_IDS[name]}')"),
+        Text(f"merl train {name}"),
+    ]
+    if name in OCCLUDED:
+        lines.append(Text(f"merl train {name} --occluded   (a disc hides the object)"))
+    entry = Table.grid(padding=(0, 2))
+    shows_pictures = console.color_system is not None and console.width >= 2 * PICTURE_WIDTH
+    entry.add_row(*([_blocks(picture)] if shows_pictures else []), Group(*lines, Text()))
+    return entry
+
+
+def _picture(name: str) -> NDArray[np.uint8]:
+    env = make_env(name, renderer="warp", image_size=PICTURE_SIZE, observations=("image",))
+    try:
+        image: NDArray[np.uint8] = env.reset(seed=START)[0]["image"]
+        return image
+    finally:
+        env.close()
+
+
+def _blocks(picture: NDArray[np.uint8]) -> Text:
+    """A square picture in characters: each shows two pixels, one above the other."""
+    side = PICTURE_WIDTH
+    small = np.asarray(Image.fromarray(picture).resize((side, side), Image.Resampling.BOX))
+    text = Text()
+    for upper, lower in zip(small[::2], small[1::2], strict=True):
+        for top, bottom in zip(upper, lower, strict=True):
+            text.append("▀", style=f"rgb({_rgb(top)}) on rgb({_rgb(bottom)})")
+        text.append("\n")
+    return text
+
+
+def _rgb(pixel: NDArray[np.uint8]) -> str:
+    return ",".join(str(value) for value in pixel)
+
+
+def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(picture).save(path)
+    except OSError as error:
+        raise MerlError(f"{path} cannot be written: {error.strerror or error}") from None

@@ -97,9 +97,10 @@ class JacoTask(composer.Task):  # type: ignore[misc]
             position=distributions.Uniform(*HAND_SPAWN),
             quaternion=workspaces.DOWN_QUATERNION,
         )
+        above_floor = np.array([0.0, 0.0, prop_height])
         self._place_prop = initializers.PropPlacer(
             props=[prop],
-            position=distributions.Uniform(*(np.array(OBJECT_SPAWN) + [0.0, 0.0, prop_height])),
+            position=distributions.Uniform(*(np.array(OBJECT_SPAWN) + above_floor)),
             quaternion=workspaces.uniform_z_rotation,
             settle_physics=True,
         )

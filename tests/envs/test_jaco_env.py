@@ -36,10 +36,18 @@ def episode(env, steps=5, action_seed=0, **reset):
     return seen
 
 
-@pytest.mark.parametrize("proprio", ["paper", "full"])
-def test_gymnasium_finds_nothing_wrong(proprio):
-    config = {"proprio": proprio, "observations": ("image", "proprio", "state")}
-    env = make_env("reach_duplo", renderer="warp", image_size=32, render_mode="rgb_array", **config)
+@pytest.mark.parametrize(
+    ("task", "config"),
+    [
+        ("reach_duplo", {"proprio": "paper"}),
+        ("reach_duplo", {"proprio": "full"}),
+        ("move_box", {"proprio": "paper"}),
+        ("lift_box", {"proprio": "full", "occluded": True}),
+    ],
+)
+def test_gymnasium_finds_nothing_wrong(task, config):
+    config = {**config, "observations": ("image", "proprio", "state")}
+    env = make_env(task, renderer="warp", image_size=32, render_mode="rgb_array", **config)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for known in ("Box observation space m", "environment not having a spec"):
@@ -90,15 +98,33 @@ def test_episodes_differ_and_can_be_taken_up_again(blind):
     another.close()
 
 
-def test_an_episode_ends_by_truncation_at_250_steps(blind):
-    blind.reset(seed=0)
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_ends_by_truncation_at_250_steps(task):
+    env = make_env(task, renderer="warp", observations=("proprio",))
+    env.reset(seed=0)
     for step in range(1, 251):
-        _, reward, terminated, truncated, _ = blind.step(ACTION)
+        _, reward, terminated, truncated, info = env.step(ACTION)
         assert isinstance(reward, float)
+        assert reward == sum(info["reward_terms"].values())
         assert terminated is False
         assert truncated is (step == 250)
     with pytest.raises(MerlError, match="reset"):
-        blind.step(ACTION)
+        env.step(ACTION)
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_seed_gives_the_same_episode_whatever_is_observed(task):
+    environments = [
+        make_env(task, renderer="warp", image_size=16, observations=("image", "proprio", "state")),
+        make_env(task, renderer="warp", proprio="full", observations=("proprio", "state")),
+    ]
+    one, other = (episode(env, seed=5) for env in environments)
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a["state"], b["state"])
+        np.testing.assert_array_equal(a["proprio"], b["proprio"][:24])
+    for env in environments:
+        env.close()
 
 
 def test_info_tells_success_distance_and_terms(blind):
@@ -149,7 +175,8 @@ def test_a_bad_action_moves_nothing(blind, action, message):
     ("task", "config", "message"),
     [
         ("reach_dupol", {}, "did you mean 'reach_duplo'"),
-        ("walk", {}, "choose from reach_duplo"),
+        ("walk", {}, "choose from reach_duplo, move_box, lift_box"),
+        ("reach_duplo", {"occluded": True}, "reach_duplo has no occluded form"),
         (
             "reach_duplo",
             {"renderer": "vulkan"},
@@ -203,6 +230,12 @@ def test_gymnasium_makes_every_task():
     assert env.unwrapped.config == EnvConfig(**settings)
     assert env.reset(seed=0)[0]["state"].shape == (55,)
     env.close()
+    settings["occluded"] = True
+    for env_id in ("merl/MoveBox-v0", "merl/LiftBox-v0"):
+        env = gymnasium.make(env_id, **settings)
+        assert env.unwrapped.config == EnvConfig(**settings)
+        assert env.reset(seed=0)[0]["state"].shape == (58,)
+        env.close()
 
 
 def test_every_setting_is_a_plain_value():
@@ -211,5 +244,6 @@ def test_every_setting_is_a_plain_value():
         "image_size": 84,
         "proprio": "paper",
         "observations": ("image", "proprio"),
+        "occluded": False,
         "render_size": 480,
     }

@@ -116,6 +116,25 @@ def test_brick_and_arm_are_in_the_picture(renderer, request):
         assert abs(column - across) < 0.15
 
 
+@pytest.mark.parametrize("renderer", ["warp", "gl"])
+def test_the_mark_of_move_box_is_seen_in_both(renderer, request):
+    if renderer == "gl":
+        request.getfixturevalue("opengl")
+    env = make_env("move_box", renderer=renderer)
+
+    def green_pixels(box):
+        env._physics.data.qpos[-7:-4] = box
+        env._physics.forward()
+        red, green, blue = np.moveaxis(env._picture(84).astype(int), 2, 0)
+        return int(((green > 2 * red) & (green > 2 * blue) & (green > 60)).sum())
+
+    env.reset(seed=0)
+    away, near = green_pixels((0.1, 0.1, 0.025)), green_pixels((0.01, -0.2, 0.025))
+    env.close()
+    assert 110 < away < 190  # 140 or so, in 84 x 84
+    assert 0.25 * away < near < 0.75 * away
+
+
 def test_pictures_are_new_arrays_and_follow_the_arm(warp_env):
     first = warp_env.reset(seed=0)[0]["image"]
     kept = first.copy()

@@ -1,0 +1,238 @@
+"""move_box and lift_box: their starts, their rewards in the simulation, what the camera sees."""
+
+import mujoco_warp
+import numpy as np
+import pytest
+import warp
+from dm_control import composer
+
+from merl.core import MerlError
+from merl.tasks import OCCLUDED, TASKS, jaco, make_task, rewards
+from merl.tasks.box import BOX_HALF_SIZE, BOX_MASS
+
+BOX_TASKS = [("move_box", False), ("lift_box", False), ("move_box", True), ("lift_box", True)]
+
+
+class Episodes:
+    """A task, started in the way of `JacoEnv`: one physics for all episodes."""
+
+    def __init__(self, name, occluded=False):
+        self.name, self.occluded = name, occluded
+        self.task = make_task(name, occluded=occluded)
+        self.physics = self.task.compile()
+
+    def start(self, seed):
+        self.task.start_episode(self.physics, np.random.RandomState(seed))
+        return self.physics
+
+    def put_box(self, position):
+        self.physics.data.qpos[-7:] = (*position, 1.0, 0.0, 0.0, 0.0)
+        self.physics.forward()
+
+
+@pytest.fixture(scope="module", params=BOX_TASKS, ids=lambda p: p[0] + "-occluded" * p[1])
+def episodes(request):
+    return Episodes(*request.param)
+
+
+class Segmentation:
+    """Counts the pixels of geoms as the tasks' camera sees them."""
+
+    def __init__(self, physics, size):
+        self._source, self._model = physics.data.ptr, mujoco_warp.put_model(physics.model.ptr)
+        self._data = mujoco_warp.put_data(physics.model.ptr, self._source)
+        self._context = mujoco_warp.create_render_context(
+            physics.model.ptr,
+            nworld=1,
+            cam_active=[jaco.CAMERA.name],
+            cam_res=(size, size),
+            render_rgb=False,
+            render_depth=False,
+            render_seg=True,
+        )
+
+    def pixels(self, geom):
+        for name in ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat"):
+            pose = getattr(self._data, name).numpy()[0]
+            pose[:] = getattr(self._source, name).reshape(pose.shape)
+        mujoco_warp.refit_bvh(self._model, self._data, self._context)
+        mujoco_warp.render(self._model, self._data, self._context)
+        geoms = self._context.seg_data.numpy().reshape(-1, 2)[:, 0]
+        return int((geoms == geom).sum())
+
+
+@pytest.fixture(autouse=True, scope="module")
+def on_the_cpu():
+    with warp.ScopedDevice("cpu"):
+        yield
+
+
+def box_geom(episodes):
+    return int(episodes.physics.bind(episodes.task.prop.geom).element_id)
+
+
+def touching(physics, one, other):
+    return any(
+        {c.geom1, c.geom2} & one and {c.geom1, c.geom2} & other for c in physics.data.contact
+    )
+
+
+def check_starts(episodes, seeds):
+    task = episodes.task
+    yaws, closures = [], []
+    for seed in seeds:
+        physics = episodes.start(seed)
+        hand, box = task.tool_center_point(physics), task.prop_position(physics)
+        assert (hand >= np.array(jaco.HAND_SPAWN.lower) - 0.002).all()
+        assert (hand <= np.array(jaco.HAND_SPAWN.upper) + 0.002).all()
+        assert (np.abs(box[:2]) <= 0.101).all()
+        assert box[2] == pytest.approx(BOX_HALF_SIZE, abs=1e-3)
+        robot = set(physics.bind(task.arm.mjcf_model.find_all("geom")).element_id)
+        everything = set(range(physics.model.ngeom))
+        assert not touching(physics, robot, everything - robot)
+        w, _, _, z = physics.data.qpos[-4:]
+        yaws.append(2 * np.arctan2(z, w) % (2 * np.pi))
+        low, high = physics.bind(task.hand.joints).range.T
+        closures.append(((physics.bind(task.hand.joints).qpos - low) / (high - low)).mean())
+    return np.array(yaws), np.array(closures)
+
+
+def test_starts_lie_within_their_boxes_and_touch_nothing(episodes):
+    check_starts(episodes, range(10))
+
+
+@pytest.mark.long
+def test_yaw_and_fingers_start_anywhere(episodes):
+    yaws, closures = check_starts(episodes, range(500))
+    for share in (yaws / (2 * np.pi), closures):
+        counts = np.histogram(share, bins=5, range=(0, 1))[0]
+        assert counts.min() > 60  # 100 in each of the five is expected
+
+
+def check_fast_starts(episodes, seeds):
+    """The first and the tenth start are those of an environment that compiles in every episode."""
+    task = make_task(episodes.name, occluded=episodes.occluded)
+    slow = composer.Environment(task, time_limit=10.0)
+    for seed in seeds:
+        slow._random_state = np.random.RandomState(seed)
+        slow.reset()
+        expected = slow.physics.data
+        for start in range(10):
+            physics = episodes.start(seed if start in (0, 9) else seed + 1000 * start)
+            if start in (0, 9):
+                np.testing.assert_allclose(physics.data.qpos, expected.qpos, rtol=0, atol=1e-6)
+                np.testing.assert_allclose(physics.data.qvel, expected.qvel, rtol=0, atol=1e-6)
+    slow.close()
+
+
+def test_starts_are_those_of_the_slow_way(episodes):
+    check_fast_starts(episodes, range(2))
+
+
+@pytest.mark.long
+def test_a_hundred_starts_are_those_of_the_slow_way(episodes):
+    check_fast_starts(episodes, range(100))
+
+
+def test_box_and_target(episodes):
+    physics, task = episodes.start(0), episodes.task
+    geom = physics.bind(task.prop.geom)
+    assert physics.model.body_mass[physics.model.geom_bodyid[geom.element_id]] == BOX_MASS == 0.1
+    np.testing.assert_array_equal(geom.size, 3 * [0.025])
+    target = {"move_box": (0.0, -0.2, 0.025), "lift_box": (0.0, 0.0, 0.18)}[episodes.name]
+    if (episodes.name, episodes.occluded) == ("lift_box", True):
+        target = (0.0, 0.0, 0.22)
+    np.testing.assert_array_equal(task.target, target)
+    state = task.state(physics)
+    assert state.shape == (58,)
+    np.testing.assert_allclose(state[42:45], task.prop_position(physics), atol=1e-6)
+    np.testing.assert_array_equal(state[-3:], np.float32(target))
+    np.testing.assert_array_equal(state[:42], task.proprio(physics, "full"))
+
+
+def test_success_and_rewards_follow_the_distances(episodes):
+    task, draw = episodes.task, np.random.RandomState(0)
+    physics = episodes.start(1)
+    for distance in draw.uniform(0.0, 0.15, 200):
+        direction = draw.normal(size=3)
+        episodes.put_box(task.target + distance * direction / np.linalg.norm(direction))
+        assert task.distance(physics) == pytest.approx(distance, abs=1e-9)
+        assert task.success(physics) == (task.distance(physics) <= 0.01)
+    for distance in draw.uniform(0.0, 0.15, 200):
+        direction = draw.normal(size=3)
+        hand = task.tool_center_point(physics)
+        episodes.put_box(hand + distance * direction / np.linalg.norm(direction))
+        assert task.hand_distance(physics) == pytest.approx(distance, abs=1e-9)
+        terms = task.reward_terms(physics)
+        assert tuple(terms) == task.term_names
+        assert terms["reaching"] == pytest.approx(rewards.reach(distance)["reaching"] / len(terms))
+        gated = terms["pushing"] if episodes.name == "move_box" else terms["lifting"]
+        assert (gated > 0) == (distance < 0.05)  # hand and box are in the air
+        assert task.get_reward(physics) == sum(terms.values())
+        assert 0 <= task.get_reward(physics) <= 1
+
+
+def test_doing_nothing_is_paid_for_an_upright_hand_alone(episodes):
+    """The hand starts vertical: a rising return proves little until it passes this one."""
+    terms = episodes.task.reward_terms(episodes.start(4))
+    assert sum(terms.values()) == pytest.approx(
+        0.25 if episodes.name == "lift_box" else 0, abs=0.01
+    )
+
+
+def test_the_box_at_rest_can_succeed():
+    """The target of move_box lies where a box on the floor can be."""
+    episodes = Episodes("move_box")
+    physics = episodes.start(0)
+    episodes.put_box((0.0, -0.2, 0.03))
+    physics.step(200)
+    assert episodes.task.success(physics)
+
+
+def test_the_mark_is_seen_around_the_box_and_touches_nothing():
+    episodes = Episodes("move_box")
+    physics = episodes.start(0)
+    mark = physics.model.name2id("mark", "geom")
+    assert physics.model.geom_rgba[mark, 3] == 1.0
+    counter = Segmentation(physics, 84)
+    alone = counter.pixels(mark)
+    episodes.put_box((0.01, -0.2, 0.025))
+    behind = counter.pixels(mark)
+    assert alone > 100
+    assert 0.25 * alone < behind < 0.75 * alone
+    physics.step(100)
+    assert all(mark not in (contact.geom1, contact.geom2) for contact in physics.data.contact)
+
+
+def hidden_shares(name, seeds, size):
+    """Of each start's pixels of the box: the share that the disc hides."""
+    occluded, plain = Episodes(name, occluded=True), Episodes(name)
+    count, count_plain = (Segmentation(e.physics, size) for e in (occluded, plain))
+    shares = []
+    for seed in seeds:
+        occluded.start(seed)
+        plain.physics.data.qpos[:] = occluded.physics.data.qpos
+        plain.physics.forward()
+        free = count_plain.pixels(box_geom(plain))
+        assert free > 0
+        shares.append(1.0 - count.pixels(box_geom(occluded)) / free)
+    return np.array(shares)
+
+
+@pytest.mark.parametrize("name", OCCLUDED)
+def test_the_disc_hides_half_of_the_box_in_half_of_the_starts(name):
+    assert (hidden_shares(name, range(60), 120) >= 0.5).mean() >= 0.45
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", OCCLUDED)
+def test_the_disc_hides_half_of_the_box_in_half_of_a_thousand_starts(name):
+    assert (hidden_shares(name, range(1000), 240) >= 0.5).mean() >= 0.5
+
+
+def test_tasks_by_name():
+    assert list(TASKS) == ["reach_duplo", "move_box", "lift_box"]
+    with pytest.raises(MerlError, match="did you mean 'move_box'"):
+        make_task("move_boxes")
+    with pytest.raises(MerlError, match="reach_duplo has no occluded form: choose from move_box"):
+        make_task("reach_duplo", occluded=True)

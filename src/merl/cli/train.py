@@ -17,7 +17,7 @@ from rich.filesize import decimal
 from merl.cli.parsing import meant, parse, program
 from merl.cli.summary import summarize
 from merl.core import MerlError
-from merl.experiments.presets import ABOUT, PRESETS
+from merl.experiments.presets import ABOUT, PRESETS, preset_for
 from merl.replay import replay_bytes
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
@@ -27,9 +27,10 @@ from merl.training.trainer import Trainer
 
 
 def train(args: list[str]) -> int:
-    """Train an agent: merl train TASK [--preset paper|laptop|smoke] [--steps N] ..."""
+    """Train an agent: merl train TASK [--preset paper|laptop|state|smoke] [--steps N] ..."""
     preset, why = _choose_preset(args)
-    config = parse(TrainConfig, "merl train", args, default=PRESETS[preset])
+    task = parse(TrainConfig, "merl train", args, default=PRESETS[preset]).task
+    config = parse(TrainConfig, "merl train", args, default=preset_for(preset, task))
     return _train(config, f"preset {preset} ({why}; {ABOUT[preset]})")
 
 

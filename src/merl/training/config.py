@@ -43,7 +43,7 @@ class TrainConfig:
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """What is to be learnt, e.g. reach_duplo."""
     preset: str = "paper"
-    """paper, laptop or smoke: which set of values the others are taken from."""
+    """paper, laptop, state or smoke: which set of values the others are taken from."""
     seed: int = 0
     """The seed of everything random in the run."""
     steps: int = 1_000_000

@@ -7,7 +7,7 @@ from matplotlib.image import imread
 from merl.core import MerlError
 from merl.report import figures
 from merl.report.curves import Curve
-from merl.report.figures import learning_curve, learning_curves
+from merl.report.figures import learning_curve, learning_curves, reward_terms
 
 HEADER = (
     "step,time/seconds,train/return,eval/return,eval/return_low,eval/return_high,"
@@ -33,9 +33,9 @@ def write_run(run, steps, offset=0.0):
 def drawn(monkeypatch):
     """The figures that were saved, to look into."""
     seen = []
-    save = figures._save
+    save = figures.save
     monkeypatch.setattr(
-        figures, "_save", lambda figure, to: (seen.append(figure), save(figure, to))[1]
+        figures, "save", lambda figure, to: (seen.append(figure), save(figure, to))[1]
     )
     return seen
 
@@ -191,3 +191,24 @@ def test_what_cannot_be_drawn_is_one_clear_line(tmp_path):
     with pytest.raises(MerlError, match="cannot be written"):
         learning_curve(run, run / "config.json" / "curve.png")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_panel_for_each_run_and_a_curve_for_each_term(tmp_path, drawn):
+    rows = ["step,eval/return,eval/reward/reaching,eval/reward/pushing\n"]
+    rows += [f"{1000 * i},{3 * i},{2 * i},{i}\n" for i in range(1, 31)]
+    (tmp_path / "metrics.csv").write_text("".join(rows))
+    beside = {"second": {"reaching": 40.0}}
+    path = reward_terms(
+        {"first": tmp_path, "second": tmp_path}, tmp_path / "terms.png", references=beside
+    )
+    assert path.is_file()
+    first, second = drawn[0].axes
+    assert [axes.get_title(loc="left") for axes in (first, second)] == ["first", "second"]
+    assert [len(axes.lines) for axes in (first, second)] == [2, 3]
+    assert {"reaching 60", "pushing 30"} <= set(words(drawn[0]))
+
+
+def test_a_run_without_terms_has_nothing_to_draw(tmp_path):
+    (tmp_path / "metrics.csv").write_text("step,eval/return\n1000,2.0\n")
+    with pytest.raises(MerlError, match="mine: .* has no terms of a reward"):
+        reward_terms({"mine": tmp_path}, tmp_path / "terms.png")

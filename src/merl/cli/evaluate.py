@@ -10,8 +10,10 @@ import tyro
 from rich.console import Console
 
 from merl.cli.parsing import parse, write_json
+from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
+from merl.report.references import references
 from merl.training.console import describe
 from merl.training.evaluation import EVALUATION_SEED, load_policy
 from merl.training.evaluation import evaluate as evaluate_policy
@@ -59,6 +61,10 @@ def evaluate(args: list[str]) -> int:
     seen = options.renderer or policy.config.env.renderer
     told = f"{options.run} at step {policy.step:,}, {seen} pictures: {describe(result)}"
     console.print(told, highlight=False)
+    config = policy.config
+    beside = references(config.task, occluded=config.env.occluded)
+    if beside:
+        console.print(comparison(config.task, result, beside), highlight=False)
     if options.video is not None:
         console.print(f"video: {options.video}", highlight=False, soft_wrap=True)
     if options.json is not None:

@@ -1,0 +1,62 @@
+"""What a return is to be compared with: acting at random, not acting, a scripted expert.
+
+The numbers lie in `references.json`, which `docs/measure_references.py` writes; those of others are
+quoted with their source.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from merl.statistics import Interval
+
+
+@dataclass(frozen=True)
+class Reference:
+    """How something else does on a task.
+
+    Attributes:
+        name: what it is, e.g. "random actions".
+        returns: its mean return with a 95 % interval; without one both ends are the mean.
+        success_end: its rate of success at the end of the episode, likewise; None if not known.
+        source: where the number comes from.
+    """
+
+    name: str
+    returns: Interval
+    success_end: Interval | None
+    source: str
+
+
+def references(task: str, *, occluded: bool = False) -> tuple[Reference, ...]:
+    """The references of a task, from the least to the best; none for a task that is not known.
+
+    Args:
+        task: the task's name.
+        occluded: in its occluded form.
+    """
+    rows = _measured().get(task + OCCLUDED * occluded, [])
+    return tuple(
+        Reference(
+            row["name"],
+            Interval(*row["return"]),
+            None if row["success_end"] is None else Interval(*row["success_end"]),
+            row["source"],
+        )
+        for row in rows
+    )
+
+
+OCCLUDED = " occluded"
+"""What is added to a task's name for its occluded form."""
+
+
+@cache
+def _measured() -> dict[str, list[dict[str, Any]]]:
+    text = (files("merl.report") / "references.json").read_text()
+    table: dict[str, list[dict[str, Any]]] = json.loads(text)
+    return table

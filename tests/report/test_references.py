@@ -1,0 +1,33 @@
+"""What returns are compared with."""
+
+from merl.report.references import references
+
+
+def test_every_task_has_a_floor_and_a_ceiling():
+    for task, occluded in [
+        ("reach_duplo", False),
+        ("move_box", False),
+        ("lift_box", False),
+        ("move_box", True),
+        ("lift_box", True),
+    ]:
+        rows = {row.name: row for row in references(task, occluded=occluded)}
+        chance, still, expert = (
+            rows[name] for name in ("random actions", "no motion", "scripted expert")
+        )
+        assert chance.returns.low <= chance.returns.mean <= chance.returns.high
+        assert max(chance.returns.high, still.returns.high) < expert.returns.low
+        assert expert.success_end is not None
+        assert expert.success_end.mean >= 0.95
+        assert still.success_end is not None
+        assert still.success_end.mean < 0.05
+
+
+def test_what_is_published_says_where():
+    published = references("reach_duplo")[-1]
+    assert (published.name, published.returns.mean) == ("DrQ-v2", 224.6)
+    assert "published" in published.source
+
+
+def test_a_task_of_ones_own_has_none():
+    assert references("my_package:make_env") == ()

@@ -210,5 +210,5 @@ def test_a_panel_for_each_run_and_a_curve_for_each_term(tmp_path, drawn):
 
 def test_a_run_without_terms_has_nothing_to_draw(tmp_path):
     (tmp_path / "metrics.csv").write_text("step,eval/return\n1000,2.0\n")
-    with pytest.raises(MerlError, match="mine: .* has no terms of a reward"):
+    with pytest.raises(MerlError, match=r"mine: .* has no terms of a reward"):
         reward_terms({"mine": tmp_path}, tmp_path / "terms.png")

@@ -24,7 +24,7 @@ OUTPUT = Path(__file__).parent.parent / "src/merl/report/references.json"
 PUBLISHED = {
     "reach_duplo": [
         {
-            "name": "DrQ-v2",
+            "name": "best known: DrQ-v2",
             "return": [224.6, 224.6, 224.6],
             "success_end": None,
             "source": "published, 2.98M frames, 10 seeds",

@@ -255,12 +255,23 @@ BAD = {
     "train reach_duplo --stepz 4": "did you mean --steps",
     "train reach_duplo --preset lptop": "did you mean 'laptop'",
     "train reach_duplo --preset=": "preset '' is unknown",
-    "train reach_duplo --steps 0": "steps must be at least 1, not 0",
-    "train reach_duplo --steps -5": "steps must be at least 1, not -5",
+    "train reach_duplo --steps 0": "steps must be at least 1",
+    "train reach_duplo --steps -5": ", not -5",
     "train reach_duplo --steps five": "'five'",
     "train reach_duplo --steps 100 --replay.batch-size 101": "batch-size 101 is more than the 100",
     "train reach_duplo --replay.capacity 8 --replay.batch-size 16": "batch",
+    "train reach_duplo --steps 10000000000000000000000": "at most 1,000,000,000,000",
+    "train reach_duplo --occluded": "reach_duplo has no occluded form: choose from move_box",
     "train reach_duplo --replay.n-step 0": "n-step is 0",
+    "train reach_duplo --replay.n-step 100000000000": "n-step is 100000000000: give at most 1000",
+    "train reach_duplo --replay.frame-stack 100000": "frame-stack is 100000: give at most 100",
+    "train reach_duplo --replay.batch-size 1000000 --steps 1000000": "batch-size 1000000 would take",
+    "train reach_duplo --agent.hidden-dim 60000": "networks of agent.* would take",
+    "train reach_duplo --agent.hidden-dim 100000000": "hidden-dim must be at least 1 and at most",
+    "train reach_duplo --agent.shift-pad 32": "out of sight: give at most 31",
+    "train reach_duplo --threads 1000000": "but this machine has",
+    "train reach_duplo --render-size 100000": "render_size is 100000: ",
+    f"train reach_duplo --run-dir {'a' * 300}": "cannot be used: File name too long",
     "train reach_duplo --agent.tau 0": "(0, 1], not 0.0",
     "train reach_duplo --agent.tau 1.01": "(0, 1], not 1.01",
     "train reach_duplo --agent.tau nan": "(0, 1], not nan",
@@ -313,7 +324,8 @@ def test_an_existing_folder_is_left_alone(
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_gl_without_opengl_names_the_way_on(tmp_path: Path) -> None:
+@pytest.mark.parametrize("opengl", [{"MUJOCO_GL": "disabled"}, {"MUJOCO_GL": "glfw"}])
+def test_gl_without_opengl_names_the_way_on(tmp_path: Path, opengl: dict[str, str]) -> None:
     arguments = ["train", "reach_duplo", "--preset", "smoke", "--renderer", "gl"]
     done = subprocess.run(
         [*MERL, *arguments],
@@ -321,7 +333,7 @@ def test_gl_without_opengl_names_the_way_on(tmp_path: Path) -> None:
         text=True,
         check=False,
         cwd=tmp_path,
-        env=os.environ | {"MUJOCO_GL": "disabled"},
+        env=os.environ | opengl | {"DISPLAY": ":77"},  # where no screen is
         timeout=120,
     )
     assert done.returncode == 2
@@ -342,6 +354,60 @@ def test_it_trains_where_opengl_is_switched_off(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    process = subprocess.Popen(
+        [*MERL, "train", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    process.stdout = None
+    _, error = process.communicate(timeout=60)
+    assert "Traceback" not in error
+    assert process.returncode == 141
+
+
+def test_ctrl_c_before_training_says_that_nothing_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("merl.training.trainer.measure", stop)
+    assert main(["train", "reach_duplo", "--preset", "smoke"]) == 130
+    assert "nothing was written" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (lambda record: record.update(observation_space=[]), "cannot be read"),
+        (lambda record: record["config"].update(env=None), "env is None"),
+        (lambda record: record["config"]["agent"].update(latent_dim=128.0), "latent_dim is 128.0"),
+        (lambda record: record["config"]["agent"].update(tau=5), "tau must lie in (0, 1]"),
+        (lambda record: record["config"]["agent"].update(conv_strides=[2, "1"]), "strides is '1'"),
+        (lambda record: record["config"].update(seed=True), "seed is True"),
+        (lambda record: record.pop("machine"), "it has no 'machine'"),
+        (lambda record: record.update(resumed=3), "cannot be read"),
+        (lambda record: record.update(format=99), "it has format 99"),
+    ],
+)
+def test_a_damaged_config_is_one_line(  # type: ignore[no-untyped-def]
+    run: Path, tmp_path: Path, damage, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run").mkdir()
+    record = json.loads((run / "config.json").read_text())
+    damage(record)
+    (tmp_path / "run" / "config.json").write_text(json.dumps(record))
+    for command in ("evaluate", "resume"):
+        assert main([command, str(tmp_path / "run")]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert "config.json cannot be read: " in error
+        assert told in error
 
 
 def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:

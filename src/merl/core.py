@@ -6,8 +6,9 @@ Names follow the field: an *observation* is a dict of modalities, a *transition*
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -37,6 +38,12 @@ class MerlError(Exception):
     """
 
 
+def meant(name: str, known: Iterable[str]) -> str:
+    """The way out of a name that is unknown: what was perhaps meant, or all that there is."""
+    close = get_close_matches(name, list(known), n=1)
+    return f"did you mean {close[0]!r}?" if close else f"choose from {', '.join(known)}"
+
+
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     """Refuse a value that is none of the choices.
 
@@ -44,7 +51,7 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         MerlError: naming the value and the choices.
     """
     if value not in choices:
-        raise MerlError(f"{name} {value!r} is unknown: choose from {', '.join(choices)}")
+        raise MerlError(f"{name} {value!r} is unknown: {meant(str(value), choices)}")
 
 
 def is_image(space: spaces.Space[Any]) -> bool:

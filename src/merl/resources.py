@@ -33,9 +33,16 @@ def free_disk(directory: Path) -> int:
 def existing_parent(path: Path) -> Path:
     """The path itself if it exists, else its nearest parent that does."""
     path = path.absolute()
-    while not path.exists():
+    while not _is_there(path):
         path = path.parent
     return path
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # too long a name, or a folder that may not be searched
+        return False
 
 
 def reserve_file(path: Path, size: int) -> None:

@@ -25,7 +25,7 @@ def test_every_task_has_a_floor_and_a_ceiling():
 
 def test_what_is_published_says_where():
     published = references("reach_duplo")[-1]
-    assert (published.name, published.returns.mean) == ("DrQ-v2", 224.6)
+    assert (published.name, published.returns.mean) == ("best known: DrQ-v2", 224.6)
     assert "published" in published.source
 
 

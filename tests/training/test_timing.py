@@ -45,7 +45,7 @@ def test_only_what_is_left_open_is_timed(precision, threads, tried) -> None:  # 
     config = dataclasses.replace(CONFIG, agent=agent, threads=threads)
     env = DotEnv()
     env.length = 10_000
-    timing = measure(config, env, env.observation_space, torch.device("cpu"))
+    timing = measure(config, env, DotEnv(), env.observation_space, torch.device("cpu"))
     assert set(timing.update) == tried
     assert all(seconds > 0 for seconds in timing.update.values())
     assert timing.step > 0

@@ -29,6 +29,9 @@ from merl.networks.heads import Actor, HeadSize, TwinCritic
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
 
+WIDEST = 65_536
+"""More than any layer here has ever been given."""
+
 
 @dataclass(frozen=True)
 class MERLConfig(DDPGConfig):
@@ -62,14 +65,20 @@ class MERLConfig(DDPGConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("latent_dim", "conv_channels", "head_layers", "hidden_dim"):
-            if getattr(self, name) < 1:
+            if not 1 <= getattr(self, name) <= WIDEST:
                 flag = name.replace("_", "-")
-                raise MerlError(f"agent.{flag} must be at least 1, not {getattr(self, name)}")
+                raise MerlError(
+                    f"agent.{flag} must be at least 1 and at most {WIDEST}, "
+                    f"not {getattr(self, name)}"
+                )
         check_choice("agent.squash", self.squash, get_args(Squash))
         for name in ("shift_pad", "vector_encoder_dim"):
-            if getattr(self, name) < 0:
+            if not 0 <= getattr(self, name) <= WIDEST:
                 flag = name.replace("_", "-")
-                raise MerlError(f"agent.{flag} must be at least 0, not {getattr(self, name)}")
+                raise MerlError(
+                    f"agent.{flag} must be at least 0 and at most {WIDEST}, "
+                    f"not {getattr(self, name)}"
+                )
         if not self.conv_strides or min(self.conv_strides) < 1:
             raise MerlError(
                 f"agent.conv-strides {self.conv_strides} must name a stride of at least 1 for each "
@@ -130,6 +139,11 @@ def make_merl(
 def _image_encoder(config: MERLConfig, space: spaces.Space[Any], stack: int) -> ConvEncoder:
     assert space.shape is not None
     height, width, channels = space.shape
+    if config.shift_pad >= min(height, width):
+        raise MerlError(
+            f"agent.shift-pad {config.shift_pad} moves a picture of {height}x{width} pixels out of "
+            f"sight: give at most {min(height, width) - 1}"
+        )
     return ConvEncoder(stack * channels, (height, width), config.conv_channels, config.conv_strides)
 
 

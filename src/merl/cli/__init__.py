@@ -1,12 +1,13 @@
 """The command line.
 
 Exit codes: 0 done; 2 bad input, told in one line; 129, 130 and 143 stopped by SIGHUP, Ctrl-C or
-SIGTERM, saved and ready to go on.
+SIGTERM, with a run that had begun saved and ready to go on; 141 nobody reads what is written.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -14,8 +15,7 @@ from importlib import import_module
 from typing import Any
 
 import merl
-from merl.cli.parsing import meant
-from merl.core import MerlError
+from merl.core import MerlError, meant
 
 # The modules are imported when called: a misspelt command should not wait for torch.
 COMMANDS = {
@@ -51,6 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:  # the reader has gone, e.g. `merl ... --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:

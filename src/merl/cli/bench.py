@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.console import Console
 
 from merl.bench import BENCHES
-from merl.cli.parsing import meant, parse, write_json
-from merl.core import MerlError
+from merl.cli.parsing import parse, write_json
+from merl.core import MerlError, meant
 
 
 def bench(args: list[str]) -> int:

@@ -9,8 +9,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterable
-from difflib import get_close_matches
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -73,12 +72,6 @@ def program() -> str:
     if found or called.name != "merl":
         return "merl"
     return os.path.relpath(called)
-
-
-def meant(name: str, known: Iterable[str]) -> str:
-    """What a misspelt name was perhaps meant to be, or all that there is."""
-    close = get_close_matches(name, list(known), n=1)
-    return f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -17,6 +17,7 @@ from merl.training.config import TrainConfig
 from merl.training.evaluation import Evaluation, evaluate, make_run_env
 from merl.training.trainer import Outcome
 
+
 def summarize(outcome: Outcome, console: Console) -> None:
     """Print the table, draw the curve, say plainly what was learnt, and how to go on."""
     run, trained = outcome.run, outcome.evaluation

@@ -14,9 +14,9 @@ import tyro
 from rich.console import Console
 from rich.filesize import decimal
 
-from merl.cli.parsing import meant, parse, program
+from merl.cli.parsing import parse, program
 from merl.cli.summary import summarize
-from merl.core import MerlError
+from merl.core import MerlError, meant
 from merl.experiments.presets import ABOUT, PRESETS, preset_for
 from merl.replay import replay_bytes
 from merl.training.checkpoint import Checkpoint
@@ -53,11 +53,10 @@ def resume(args: list[str]) -> int:
 
 def _resumed_config(run: Run, start: Checkpoint, options: ResumeOptions) -> TrainConfig:
     """The run's config with what the user changes; on another machine what it decided is open."""
-    config = dataclasses.replace(
-        run.config, minutes=options.minutes, steps=options.steps or run.config.steps
-    )
-    if start.step > config.steps:
-        raise MerlError(f"--steps {config.steps} is less than the {start.step:,} already taken")
+    steps = options.steps or run.config.steps
+    if start.step > steps:
+        raise MerlError(f"--steps {steps} is less than the {start.step:,} already taken")
+    config = dataclasses.replace(run.config, minutes=options.minutes, steps=steps)
     if run.has_moved() or options.device not in (None, config.device):
         agent = dataclasses.replace(config.agent, precision="auto")
         config = dataclasses.replace(config, threads=None, agent=agent)
@@ -85,8 +84,12 @@ class ResumeOptions:
 def _train(config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint] | None = None) -> int:
     console = Console()
     with ExitStack() as stack:
-        with console.status("building the scene and timing this machine"):
-            trainer = stack.enter_context(Trainer.prepare(config, new=resumed is None))
+        try:
+            with console.status("building the scene and timing this machine"):
+                trainer = stack.enter_context(Trainer.prepare(config, new=resumed is None))
+        except KeyboardInterrupt:
+            console.print("stopped before training began: nothing was written")
+            raise
         done = resumed[1].step if resumed else 0
         console.print(_outlook(trainer, what, done), highlight=False)
         with ConsoleView(console) as view:
@@ -100,7 +103,11 @@ def _train(config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint] | Non
         console.print(f"{stopped} {how} with")
         console.print(f"    {program()} resume {folder}", highlight=False, soft_wrap=True)
         return 128 + outcome.signal
-    summarize(outcome, console)
+    try:
+        summarize(outcome, console)
+    except KeyboardInterrupt:
+        console.print(f"{folder} is trained and saved", highlight=False, soft_wrap=True)
+        raise
     return 0
 
 

@@ -5,8 +5,10 @@ Importing this is cheap; the simulator is loaded when the first environment is m
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
+from merl.core import MerlError, meant
 from merl.envs.config import EnvConfig
 
 if TYPE_CHECKING:
@@ -30,6 +32,10 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
         MerlError: the task or a setting is unknown, the renderer does not work here, or the
             simulator has the wrong version.
     """
+    known = [field.name for field in fields(EnvConfig)]
+    for name in config:
+        if name not in known:
+            raise MerlError(f"make_env has no setting {name!r}: {meant(name, known)}")
     settings = EnvConfig(**config)
     from merl.envs.jaco_env import JacoEnv
     from merl.tasks import make_task

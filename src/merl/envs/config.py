@@ -10,7 +10,7 @@ from merl.core import MerlError, check_choice
 RendererName = Literal["gl", "warp"]
 ProprioName = Literal["paper", "full"]
 OBSERVATIONS = ("image", "proprio", "state")
-SMALLEST_IMAGE = 16
+SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class EnvConfig:
     needs no OpenGL and is much faster on a CPU; its pictures look slightly different)."""
 
     image_size: int = 84
-    """Height and width of the agent's picture, in pixels; at least 16."""
+    """Height and width of the agent's picture, in pixels; from 16 to 2048."""
 
     proprio: ProprioName = "paper"
     """What the robot feels: `paper` (angles and velocities of arm and fingers, 24 numbers) or
@@ -36,20 +36,22 @@ class EnvConfig:
     see, the joints have to tell."""
 
     render_size: int = 480
-    """Height and width of the pictures for people (videos), in pixels; at least 16."""
+    """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
 
     def __post_init__(self) -> None:
         check_choice("renderer", self.renderer, get_args(RendererName))
         check_choice("proprio", self.proprio, get_args(ProprioName))
-        if not self.observations:
+        if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
-                f"observations is empty: name at least one of {', '.join(OBSERVATIONS)}"
+                f"observations is {self.observations!r}: give a tuple of at least one of "
+                f"{', '.join(OBSERVATIONS)}"
             )
         for name in self.observations:
             check_choice("observations", name, OBSERVATIONS)
         for field in ("image_size", "render_size"):
             size = getattr(self, field)
-            if type(size) is not int or size < SMALLEST_IMAGE:
+            if type(size) is not int or not SMALLEST_IMAGE <= size <= LARGEST_IMAGE:
                 raise MerlError(
-                    f"{field} is {size!r}: give a whole number, at least {SMALLEST_IMAGE}"
+                    f"{field} is {size!r}: give a whole number, at least {SMALLEST_IMAGE} and at "
+                    f"most {LARGEST_IMAGE}"
                 )

@@ -119,12 +119,27 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._physics.free()
         self._physics, self._steps_left = None, 0
 
+    @property
+    def physics(self) -> Any:
+        """The simulation (a dm_control `mjcf.Physics`), the same one as long as this is open."""
+        if self._physics is None:
+            raise MerlError("the environment is closed: make another one")
+        return self._physics
+
+    def action_for(self, velocities: NDArray[np.float64]) -> NDArray[np.float32]:
+        """The action that asks for velocities of the joints: (9,), rad/s, to (9,), in [-1, 1]."""
+        action = (velocities - self._action_center) / self._action_scale
+        return action.clip(-1.0, 1.0).astype(np.float32)
+
     def _velocities(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Target velocities of the joints, (9,), rad/s."""
         try:
-            values = np.asarray(action, dtype=np.float64)
+            given = np.asarray(action)
+            values = given.astype(np.float64) if given.dtype.kind in "fiu" else None
         except (TypeError, ValueError):
-            raise MerlError(f"action {action!r} is not an array of numbers") from None
+            values = None
+        if values is None:
+            raise MerlError(f"action {action!r} is not an array of numbers")
         if values.shape != self.action_space.shape:
             raise MerlError(f"action has shape {values.shape}: {self.action_space.shape} is needed")
         if not np.isfinite(values).all():

@@ -13,6 +13,7 @@ import os
 import sys
 import tempfile
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -109,8 +110,10 @@ def _enable_opengl() -> None:
         if name == render.BACKEND != "off":
             return
         try:
-            _reload_opengl(name)
-            render.Renderer(1, 1).free()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of GLFW, while the reason is told below
+                _reload_opengl(name)
+                _try_opengl(render)
         except Exception as reason:  # every backend fails in its own way
             _reload_opengl("disabled")
             raise MerlError(
@@ -118,6 +121,22 @@ def _enable_opengl() -> None:
                 "package libegl1, or libosmesa6 and set MUJOCO_GL=osmesa, or use --renderer warp, "
                 "which needs none"
             ) from reason
+
+
+def _try_opengl(render: Any) -> None:
+    """Make a context to draw in: GLFW fails no earlier.
+
+    Raises:
+        Exception: OpenGL does not work.
+    """
+    mujoco = importlib.import_module("mujoco")
+    renderer = render.Renderer(1, 1)
+    try:
+        empty = mujoco.MjModel.from_xml_string("<mujoco/>")
+        with renderer.make_current() as current:
+            current.call(mujoco.MjrContext, empty, mujoco.mjtFontScale.mjFONTSCALE_100)
+    finally:
+        renderer.free()
 
 
 def _choose_opengl() -> str:

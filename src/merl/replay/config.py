@@ -11,6 +11,9 @@ from merl.core import MerlError
 from merl.replay.storage import fields_of
 from merl.resources import available_memory, existing_parent, free_disk
 
+MOST_N_STEP, MOST_FRAME_STACK = 1000, 100
+"""What is still sampled in reasonable time and memory."""
+
 
 @dataclass(frozen=True)
 class ReplayConfig:
@@ -34,6 +37,10 @@ class ReplayConfig:
                 raise MerlError(
                     f"replay.{name.replace('_', '-')} is {value}: give a whole number of at least 1"
                 )
+        for name, most in (("n_step", MOST_N_STEP), ("frame_stack", MOST_FRAME_STACK)):
+            if getattr(self, name) > most:
+                flag = name.replace("_", "-")
+                raise MerlError(f"replay.{flag} is {getattr(self, name)}: give at most {most}")
         if not 0 <= self.discount <= 1:
             raise MerlError(f"replay.discount is {self.discount}: give a number from 0 to 1")
         check_batch(self.batch_size, self.capacity)

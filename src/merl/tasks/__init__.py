@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from difflib import get_close_matches
 from functools import partial
 
-from merl.core import MerlError
+from merl.core import MerlError, meant
 from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
 
 # isort: split
@@ -51,9 +50,7 @@ def make_task(name: str, *, occluded: bool = False) -> JacoTask:
         MerlError: there is no such task, or it has no occluded form.
     """
     if name not in TASKS:
-        close = get_close_matches(name, TASKS, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"choose from {', '.join(TASKS)}"
-        raise MerlError(f"task {name!r} is unknown: {hint}")
+        raise MerlError(f"task {name!r} is unknown: {meant(name, TASKS)}")
     if occluded and name not in OCCLUDED:
         raise MerlError(f"{name} has no occluded form: choose from {', '.join(OCCLUDED)}")
     return (OCCLUDED if occluded else TASKS)[name]()

@@ -194,8 +194,8 @@ def _readable(checkpoint: Checkpoint) -> Iterator[None]:
         SafetensorError,
         pickle.UnpicklingError,
     ) as error:
-        first = str(error).strip().split("\n")[0]
-        raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {first}") from None
+        why = " ".join(line.strip() for line in str(error).strip().split("\n")[:2])
+        raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {why}") from None
 
 
 def _weights(checkpoint: Checkpoint) -> dict[str, dict[str, torch.Tensor]]:

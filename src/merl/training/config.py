@@ -14,6 +14,9 @@ from merl.core import MerlError
 from merl.envs.config import EnvConfig
 from merl.replay import ReplayConfig
 
+MOST_STEPS = 10**12
+"""Far beyond what anyone will wait for."""
+
 
 @dataclass(frozen=True)
 class EvaluationConfig:
@@ -74,8 +77,11 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for name in ("steps", "keep"):
-            if getattr(self, name) < 1:
-                raise MerlError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if not 1 <= getattr(self, name) <= MOST_STEPS:
+                raise MerlError(
+                    f"{name} must be at least 1 and at most {MOST_STEPS:,}, "
+                    f"not {getattr(self, name)}"
+                )
         for name in ("random_steps", "seed_steps", "seed"):
             if getattr(self, name) < 0:
                 flag = name.replace("_", "-")

@@ -92,21 +92,19 @@ class Run:
         Raises:
             MerlError: the folder is not a run's.
         """
-        try:
-            record = json.loads((path / CONFIG_FILE).read_text())
+        with _readable(path):
+            record = _read(path)
             number = record["format"]
+            if number != FORMAT:
+                raise MerlError(f"it has format {number}, this merl reads {FORMAT}")
             config = from_plain(TrainConfig, record["config"])
-        except FileNotFoundError:
-            raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}") from None
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise MerlError(f"{path / CONFIG_FILE} cannot be read: {error!r}") from None
-        if number != FORMAT:
-            raise MerlError(f"{path} has format {number}, this merl reads {FORMAT}")
+            _recorded_spaces(record)
+            _last_machine(record)
         return cls(path, dataclasses.replace(config, run_dir=path))
 
     def record_resumption(self, step: int) -> None:
         """Note that the run goes on from `step`, with what; from now on its config is this one."""
-        record = json.loads((self.path / CONFIG_FILE).read_text())
+        record = _read(self.path)
         record["config"] = to_plain(self.config)
         record.setdefault("resumed", []).append(
             {
@@ -121,9 +119,7 @@ class Run:
 
     def has_moved(self) -> bool:
         """Whether it was trained last on another machine than this one."""
-        record = json.loads((self.path / CONFIG_FILE).read_text())
-        last = record.get("resumed", [record])[-1]
-        return bool(last["machine"] != machine())
+        return _last_machine(_read(self.path)) != machine()
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -174,11 +170,8 @@ class Run:
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
         """What the agent consumes, and its actions, without building the environment."""
-        try:
-            record = json.loads((self.path / CONFIG_FILE).read_text())
-            return _recorded_spaces(record)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise MerlError(f"{self.path / CONFIG_FILE} cannot be read: {error!r}") from None
+        with _readable(self.path):
+            return _recorded_spaces(_read(self.path))
 
 
 def run_path(config: TrainConfig) -> Path:
@@ -187,20 +180,27 @@ def run_path(config: TrainConfig) -> Path:
         return config.run_dir
     name = f"{config.task}-{config.preset}-s{config.seed}"
     numbered = (Path("runs") / f"{name}-{number}" for number in itertools.count(2))
-    return next(p for p in itertools.chain([Path("runs") / name], numbered) if not p.exists())
+    return next(p for p in itertools.chain([Path("runs") / name], numbered) if not _exists(p))
 
 
 def refuse_existing(path: Path) -> None:
     """Never write into a folder that holds something.
 
     Raises:
-        MerlError: the folder exists.
+        MerlError: the folder exists, or its name is refused by the system.
     """
-    if path.exists():
+    if _exists(path):
         raise MerlError(
             f"run folder {path} exists already: go on with `merl resume {path}`, or name another "
             "with --run-dir"
         )
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError as error:  # too long a name, a folder that may not be searched
+        raise MerlError(f"run folder {path} cannot be used: {error.strerror}") from None
 
 
 def to_plain(config: Any) -> dict[str, Any]:
@@ -210,22 +210,66 @@ def to_plain(config: Any) -> dict[str, Any]:
 
 
 def from_plain(cls: type[T], plain: Mapping[str, Any]) -> T:
-    """The config that `to_plain` took apart; fields that are not there keep their defaults."""
+    """The config that `to_plain` took apart; fields that are not there keep their defaults.
+
+    Raises:
+        TypeError: a value is not of its field's type.
+    """
     hints = typing.get_type_hints(cls)
-    known = {name: _restore(hints[name], value) for name, value in plain.items() if name in hints}
+    known = {
+        name: _restore(name, hints[name], value) for name, value in plain.items() if name in hints
+    }
     return cls(**known)
 
 
-def _restore(hint: Any, value: Any) -> Any:
+def _restore(name: str, hint: Any, value: Any) -> Any:
     if isinstance(hint, types.UnionType):
+        if value is None:
+            return None
         hint = next(option for option in typing.get_args(hint) if option is not types.NoneType)
-    if value is None:
-        return None
-    if dataclasses.is_dataclass(hint):
+    if dataclasses.is_dataclass(hint) and isinstance(value, dict):
         return from_plain(typing.cast(type[Any], hint), value)
-    if hint is Path:
+    origin = typing.get_origin(hint) or hint
+    if origin is tuple and isinstance(value, list):
+        of = typing.get_args(hint)[0]
+        return tuple(_restore(name, of, part) for part in value)
+    if origin is Path and isinstance(value, str):
         return Path(value)
-    return tuple(value) if isinstance(value, list) else value
+    plain: dict[Any, tuple[type, ...]] = {float: (int, float), typing.Literal: (str,)}
+    if not isinstance(value, plain.get(origin, (origin,))) or (
+        isinstance(value, bool) and origin is not bool
+    ):
+        raise TypeError(f"{name} is {value!r}")
+    return value
+
+
+def _read(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((path / CONFIG_FILE).read_text())
+    return record
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """What is wrong with a run's config, in one line."""
+    file = path / CONFIG_FILE
+    try:
+        yield
+    except FileNotFoundError:
+        raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}") from None
+    except UnicodeDecodeError:
+        raise MerlError(f"{file} cannot be read: it is no text") from None
+    except KeyError as error:
+        raise MerlError(f"{file} cannot be read: it has no {error}") from None
+    except OSError as error:
+        raise MerlError(f"{file} cannot be read: {error.strerror}") from None
+    except (MerlError, ValueError, TypeError, AttributeError, IndexError) as error:
+        raise MerlError(f"{file} cannot be read: {error}") from None
+
+
+def _last_machine(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Where the run was trained last."""
+    recorded: dict[str, Any] = record.get("resumed", [record])[-1]["machine"]
+    return recorded
 
 
 def package_versions() -> dict[str, str]:

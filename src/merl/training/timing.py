@@ -44,10 +44,12 @@ class Timing:
     Attributes:
         update: of one update, for each way that was tried.
         step: of acting and one environment step, picture included.
+        frame: of one picture of a video; 0 where none is made.
     """
 
     update: Mapping[Arithmetic, float]
     step: float
+    frame: float = 0.0
 
     @property
     def best(self) -> Arithmetic:
@@ -64,13 +66,18 @@ class Timing:
         updates = (config.steps - max(done, config.seed_steps)) * config.updates_per_step
         evaluations = max(1, steps // config.eval.every) * config.eval.episodes
         length = 250  # steps of an episode, near enough for an estimate
-        whole = max(0.0, updates) * self.update[self.best]
+        videos = {"each": steps // config.eval.every or 1, "last": 1, "none": 0}[config.eval.video]
+        whole = max(0.0, updates) * self.update[self.best] + videos * length * self.frame
         whole += (steps + evaluations * length) * self.step
         return min(whole, (config.minutes or float("inf")) * 60)
 
 
 def measure(
-    config: TrainConfig, env: gymnasium.Env[Any, Any], space: spaces.Dict, device: torch.device
+    config: TrainConfig,
+    env: gymnasium.Env[Any, Any],
+    eval_env: gymnasium.Env[Any, Any],
+    space: spaces.Dict,
+    device: torch.device,
 ) -> Timing:
     """Time the environment's step, and the update in every way that the config leaves open.
 
@@ -97,7 +104,8 @@ def measure(
     if config.threads is None and cores > threads:
         attempt(Arithmetic(fastest.precision, cores))
     torch.set_num_threads(threads)
-    return Timing(update, _time_step(env) + _time_acting(agent, batch))
+    frame = 0.0 if config.eval.video == "none" else _time_frame(eval_env)
+    return Timing(update, _time_step(env) + _time_acting(agent, batch), frame)
 
 
 def _agent(
@@ -146,7 +154,13 @@ def _time_step(env: gymnasium.Env[Any, Any]) -> float:
     return _median_seconds(steps) / MEASURED_STEPS
 
 
-def _median_seconds(work: Callable[[], None]) -> float:
+def _time_frame(env: gymnasium.Env[Any, Any]) -> float:
+    env.reset(seed=0)
+    env.render()
+    return _median_seconds(env.render)
+
+
+def _median_seconds(work: Callable[[], object]) -> float:
     seconds = []
     for _ in range(REPEATS):
         start = time.perf_counter()

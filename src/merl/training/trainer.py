@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -15,9 +17,10 @@ import torch
 from gymnasium import spaces
 
 from merl.agents.ddpg import DDPG
-from merl.agents.merl import make_merl, modalities
+from merl.agents.merl import make_merl, make_networks, modalities
 from merl.core import MerlError, is_image
 from merl.replay import Replay, check_fits
+from merl.resources import available_memory
 from merl.training import checkpoint
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
@@ -94,7 +97,8 @@ class Trainer:
         self.env, self.eval_env = env, eval_env
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
-        self.timing = measure(config, env, self.space, self.device)
+        check_memory(config, self.space, self.action_space)
+        self.timing = measure(config, env, eval_env, self.space, self.device)
         best = self.timing.best
         torch.set_num_threads(best.threads)
         self.config = dataclasses.replace(
@@ -126,6 +130,12 @@ class Trainer:
             MerlError: a device, renderer, sense, folder or size that is not to be had.
         """
         choose_device(config.device)
+        processors = os.cpu_count() or 1
+        if config.threads is not None and config.threads > processors:
+            raise MerlError(
+                f"threads is {config.threads}, but this machine has {processors} processors: "
+                f"give at most {processors}"
+            )
         if new:
             refuse_existing(run_path(config))
         with ExitStack() as stack:
@@ -168,6 +178,7 @@ class Trainer:
     def _run(self, run: Run, start: Checkpoint | None, view: View) -> Outcome:
         with ExitStack() as stack:
             interrupt = stack.enter_context(Interrupt().listening())
+            metrics = stack.enter_context(MetricsWriter(run.path, view.warn))
             replay = Replay(
                 self.config.replay,
                 self.space,
@@ -175,7 +186,6 @@ class Trainer:
                 directory=run.replay,
                 capacity=self.config.capacity,
             )
-            metrics = stack.enter_context(MetricsWriter(run.path, view.warn))
             stretch = _Stretch(self, run, replay, metrics, view, interrupt)
             if start is not None:
                 stretch.restore(start)
@@ -341,6 +351,31 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise MerlError("--device cuda: no CUDA device is found here; use --device cpu or auto")
     return torch.device(name)
+
+
+def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.Box) -> None:
+    """Refuse networks or batches that this process could never hold.
+
+    Counted are the weights with gradient, moments and average, and the batch's inputs with what one
+    layer makes of them: less than what an update takes, so that nothing is refused that would fit.
+
+    Raises:
+        MerlError: naming what is too large.
+    """
+    with torch.device("meta"):
+        networks = make_networks(
+            config.agent, space, action_space.shape[0], config.replay.frame_stack
+        )
+    weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
+    stack, size = config.replay.frame_stack, config.replay.batch_size
+    inputs = 2 * 5 * size * sum(math.prod(s.shape or ()) * stack for s in space.values())
+    room = available_memory()
+    for what, need in (("networks of agent.*", weights), (f"replay.batch-size {size}", inputs)):
+        if need > room:
+            raise MerlError(
+                f"{what} would take {need / 1e9:.3g} GB or more, but {room / 1e9:.3g} GB of memory "
+                "are available: make it smaller"
+            )
 
 
 def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Box]:

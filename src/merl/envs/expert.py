@@ -1,0 +1,45 @@
+"""The tasks' experts as policies: they act in an environment as a trained agent would."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from merl.core import MerlError
+from merl.envs.jaco_env import JacoEnv
+from merl.tasks.expert import Expert
+
+
+class ExpertPolicy:
+    """Solves an environment's task from the simulator's state; the observation is not looked at.
+
+    Call `reset()` before every episode, then the policy with each observation in turn.
+
+    Args:
+        env: a `JacoEnv`, wrapped or not; its actions must reach it as they are.
+
+    Raises:
+        MerlError: it is another environment.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        jaco = env.unwrapped
+        if not isinstance(jaco, JacoEnv):
+            raise MerlError(f"there is no expert for {jaco}: it solves the tasks of merl.tasks")
+        self._expert = Expert(jaco.task, jaco.physics)
+        self._to_action = jaco.action_for
+        self._fresh = True
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self._fresh = True
+
+    def __call__(self, observation: Any) -> NDArray[np.float32]:
+        """The action to take now, float32 (9,), in [-1, 1]."""
+        if self._fresh:
+            self._expert.reset()
+        self._fresh = False
+        return self._to_action(self._expert.act())

@@ -16,9 +16,11 @@ import av
 import numpy as np
 import pytest
 import torch
+from matplotlib.image import imread
 
 import merl
 from merl.cli import main
+from merl.envs.registration import ENV_IDS
 from merl.training.evaluation import EVALUATION_SEED
 
 MERL = [sys.executable, "-m", "merl.cli"]
@@ -265,7 +267,7 @@ BAD = {
     "train reach_duplo --replay.n-step 0": "n-step is 0",
     "train reach_duplo --replay.n-step 100000000000": "n-step is 100000000000: give at most 1000",
     "train reach_duplo --replay.frame-stack 100000": "frame-stack is 100000: give at most 100",
-    "train reach_duplo --replay.batch-size 1000000 --steps 1000000": "batch-size 1000000 would take",
+    "train reach_duplo --replay.batch-size 1000000 --steps 1000000": "1000000 would take",
     "train reach_duplo --agent.hidden-dim 60000": "networks of agent.* would take",
     "train reach_duplo --agent.hidden-dim 100000000": "hidden-dim must be at least 1 and at most",
     "train reach_duplo --agent.shift-pad 32": "out of sight: give at most 31",
@@ -354,6 +356,41 @@ def test_it_trains_where_opengl_is_switched_off(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_tasks_are_listed_with_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tasks", "--pictures", str(tmp_path / "pictures")]) == 0
+    told = capsys.readouterr().out
+    for task, env_id in ENV_IDS.items():
+        assert f"merl train {task}" in told
+        assert f"gymnasium.make('merl:{env_id}')" in told
+        assert imread(tmp_path / "pictures" / f"{task}.png").shape == (480, 480, 3)
+    assert "reaching + vertical + floating + lifting" in told
+    assert "merl train move_box --occluded" in told
+    (tmp_path / "file").write_text("in the way")
+    assert main(["tasks", "--pictures", str(tmp_path / "file")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_the_state_alone_can_be_learnt_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Preset state on a box task, cut short: no picture but the video's, every term told."""
+    sizes = ["--steps", "500", "--random-steps", "250", "--seed-steps", "480"]
+    folder = tmp_path / "run"
+    arguments = ["train", "lift_box", "--preset", "state", *sizes, "--eval.episodes", "2"]
+    assert main([*arguments, "--occluded", "--run-dir", str(folder)]) == 0
+    assert "no motion" in capsys.readouterr().out
+    record = json.loads((folder / "config.json").read_text())
+    assert list(record["observation_space"]) == ["state"]
+    assert record["config"]["env"]["occluded"] is True
+    last = rows(folder)[-1]
+    terms = ("reaching", "vertical", "floating", "lifting")
+    assert sum(float(last[f"eval/reward/{term}"]) for term in terms) == pytest.approx(
+        float(last["eval/return"])
+    )
+    assert 0 <= float(last["eval/success_share"]) <= 1
+    assert list((folder / "videos").iterdir())
 
 
 def test_a_reader_that_goes_away_is_no_error() -> None:

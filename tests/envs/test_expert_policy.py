@@ -1,0 +1,39 @@
+"""The experts as policies: what they ask for reaches the joints."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from merl.core import MerlError
+from merl.envs import make_env
+from merl.envs.expert import ExpertPolicy
+from merl.training.evaluation import evaluate
+
+
+class Wrapped(gymnasium.Wrapper):
+    """Changes nothing."""
+
+
+def test_evaluate_finds_the_task_solved():
+    env = Wrapped(make_env("lift_box", observations=("proprio",)))
+    policy = ExpertPolicy(env)
+    result = evaluate(policy, env, 2, reset=policy.reset)
+    assert result.success_end.mean == 1.0
+    assert result.returns.low > 150.0
+
+
+def test_an_action_asks_for_the_experts_velocities():
+    env = make_env("reach_duplo", observations=("proprio",))
+    policy = ExpertPolicy(env)
+    observation, _ = env.reset(seed=0)
+    action = policy(observation)
+    assert action.dtype == np.float32
+    assert env.action_space.contains(action)
+    velocities = policy._expert.act()
+    env.step(env.action_for(velocities))
+    np.testing.assert_allclose(env.physics.data.ctrl, velocities, rtol=0, atol=1e-6)
+
+
+def test_a_foreign_environment_is_met_with_one_sentence():
+    with pytest.raises(MerlError, match="there is no expert for"):
+        ExpertPolicy(gymnasium.make("Pendulum-v1"))

@@ -1,0 +1,80 @@
+"""Every task can be solved, and the experts do it without touching the simulation."""
+
+import numpy as np
+import pytest
+
+from merl.tasks import make_task
+from merl.tasks.expert import Expert
+from merl.tasks.jaco import EPISODE_STEPS
+
+TASKS = [
+    pytest.param("reach_duplo", False, id="reach_duplo"),
+    pytest.param("move_box", False, id="move_box"),
+    pytest.param("lift_box", False, id="lift_box"),
+    pytest.param("move_box", True, id="move_box_occluded"),
+    pytest.param("lift_box", True, id="lift_box_occluded"),
+]
+
+
+class Episodes:
+    """A task and its expert, on one physics for all episodes."""
+
+    def __init__(self, name, occluded):
+        self.task = make_task(name, occluded=occluded)
+        self.physics = self.task.compile()
+        self.expert = Expert(self.task, self.physics)
+        self.low, self.high = self.physics.model.actuator_ctrlrange.T
+
+    def start(self, seed):
+        self.task.start_episode(self.physics, np.random.RandomState(seed))
+        self.expert.reset()
+
+    def step(self):
+        before = self.physics.get_state()
+        velocities = self.expert.act()
+        np.testing.assert_array_equal(self.physics.get_state(), before)
+        assert velocities.shape == (9,)
+        assert (velocities >= self.low).all()
+        assert (velocities <= self.high).all()
+        self.physics.set_control(velocities)
+        self.physics.step(self.task.physics_steps_per_control_step)
+        return velocities
+
+    def is_solved(self, seed):
+        self.start(seed)
+        for _ in range(EPISODE_STEPS):
+            self.step()
+        return self.task.success(self.physics)
+
+
+@pytest.mark.parametrize(("name", "occluded"), TASKS)
+def test_the_expert_solves_the_task(name, occluded):
+    assert Episodes(name, occluded).is_solved(0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "occluded"), TASKS)
+def test_the_expert_solves_a_hundred_starts(name, occluded):
+    episodes = Episodes(name, occluded)
+    assert sum(episodes.is_solved(seed) for seed in range(100)) >= 95
+
+
+def test_the_same_start_gives_the_same_velocities():
+    episodes = Episodes("lift_box", False)
+    runs = []
+    for _ in range(2):
+        episodes.start(3)
+        runs.append([episodes.step() for _ in range(20)])
+    np.testing.assert_array_equal(*runs)
+
+
+def test_it_takes_hold_again_of_a_box_that_it_lost():
+    episodes = Episodes("lift_box", False)
+    episodes.start(0)
+    while episodes.task.prop_position(episodes.physics)[2] < 0.06:
+        episodes.step()
+    with episodes.physics.reset_context():  # back to the floor, out of the fingers
+        episodes.physics.data.qpos[-7:] = (0.05, 0.0, 0.025, 1.0, 0.0, 0.0, 0.0)
+    for _ in range(EPISODE_STEPS):
+        episodes.step()
+    assert episodes.task.success(episodes.physics)

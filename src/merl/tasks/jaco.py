@@ -163,6 +163,10 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         """Origin of the object's frame, (3,), m."""
         return np.array(physics.data.xpos[self._prop_body])
 
+    def prop_rotation(self, physics: mjcf.Physics) -> NDArray[np.float64]:
+        """Axes of the object's frame, (3, 3), as columns."""
+        return np.array(physics.data.xmat[self._prop_body]).reshape(3, 3)
+
     def hand_distance(self, physics: mjcf.Physics) -> float:
         """From the tool centre point to the object, m."""
         offset = self.tool_center_point(physics) - self.prop_position(physics)

@@ -23,6 +23,9 @@ class LiftBox(JacoTask):
 
     Args:
         occluded: put a disc between camera and box.
+
+    Attributes:
+        vertical_cosine: from this `tilt_cosine` on the hand counts as vertical.
     """
 
     term_names = ("reaching", "vertical", "floating", "lifting")
@@ -30,9 +33,9 @@ class LiftBox(JacoTask):
 
     def __init__(self, occluded: bool = False) -> None:
         super().__init__(make_box(), BOX_HALF_SIZE, TARGET_OVER_DISC if occluded else TARGET)
-        self._vertical_cosine = rewards.VERTICAL_COSINE
+        self.vertical_cosine = rewards.VERTICAL_COSINE
         if occluded:
-            self._vertical_cosine = VERTICAL_COSINE_AROUND_DISC
+            self.vertical_cosine = VERTICAL_COSINE_AROUND_DISC
             add_disc(self._arena, DISC_RADIUS)
 
     def distance(self, physics: mjcf.Physics) -> float:
@@ -48,5 +51,5 @@ class LiftBox(JacoTask):
             height=float(self.prop_position(physics)[2]),
             target_height=float(self.target[2]),
             goal_distance=self.goal_distance(physics),
-            vertical_cosine=self._vertical_cosine,
+            vertical_cosine=self.vertical_cosine,
         )

@@ -128,8 +128,9 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def action_for(self, velocities: NDArray[np.float64]) -> NDArray[np.float32]:
         """The action that asks for velocities of the joints: (9,), rad/s, to (9,), in [-1, 1]."""
-        action = (velocities - self._action_center) / self._action_scale
-        return action.clip(-1.0, 1.0).astype(np.float32)
+        shares = (velocities - self._action_center) / self._action_scale
+        action: NDArray[np.float32] = shares.clip(-1.0, 1.0).astype(np.float32)
+        return action
 
     def _velocities(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Target velocities of the joints, (9,), rad/s."""

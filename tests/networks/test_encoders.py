@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from merl.core import MerlError
-from merl.networks.encoders import ConvEncoder, IdentityEncoder, MLPEncoder
+from merl.networks.encoders import ConvEncoder, Standardize, VectorEncoder
 from merl.networks.representation import Encoders
 
 
@@ -58,15 +58,49 @@ def test_an_image_too_small_is_refused(
 
 
 def test_the_identity() -> None:
-    encoder = IdentityEncoder(7)
+    encoder = VectorEncoder(7)
     vector = torch.randn(3, 7)
     assert encoder(vector) is vector
     assert encoder.features == 7
     assert not list(encoder.parameters())
 
 
+def test_vectors_are_brought_to_one_scale() -> None:
+    draw = torch.Generator().manual_seed(0)
+    scale = torch.tensor([5.0, 0.05, 0.0, 1e-4])
+    center = torch.tensor([1.0, -0.2, 0.18, 0.0])
+
+    def vectors(count: int) -> torch.Tensor:
+        return center + scale * torch.randn(count, 4, generator=draw)
+
+    encoder = VectorEncoder(4, standardize=True)
+    batches = [vectors(128) for _ in range(5)]
+    for batch in batches:
+        encoder.observe(batch)
+    seen = torch.cat(batches)
+    assert encoder.scale is not None
+    torch.testing.assert_close(encoder.scale.mean, seen.mean(0))
+    torch.testing.assert_close(encoder.scale.square, seen.square().mean(0))
+    encoded = encoder(vectors(10_000))
+    assert encoded.std(0)[:2] == pytest.approx(torch.ones(2), rel=0.1)
+    assert encoded.mean(0) == pytest.approx(torch.zeros(4), abs=0.15)
+    assert encoded.std(0)[2] < 1e-3  # what never varied is not blown up
+    assert encoded.std(0)[3] == pytest.approx(0.01, rel=0.1)
+    assert not list(encoder.parameters())
+
+
+def test_the_scale_stays_once_it_has_seen_enough() -> None:
+    scale = Standardize(1)
+    for _ in range(Standardize.STEADY // 1000):
+        scale.observe(torch.randn(1000, 1))
+    before = {name: value.clone() for name, value in scale.state_dict().items()}
+    scale.observe(torch.full((1000, 1), 50.0))
+    for name, value in scale.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
 def test_the_mlp_has_two_layers_and_ends_in_a_relu() -> None:
-    encoder = MLPEncoder(7, 16)
+    encoder = VectorEncoder(7, 16)
     assert encoder.features == 16
     assert sum(isinstance(m, torch.nn.Linear) for m in encoder.modules()) == 2
     out = encoder(torch.randn(50, 7))
@@ -76,7 +110,7 @@ def test_the_mlp_has_two_layers_and_ends_in_a_relu() -> None:
 
 def test_each_modality_is_encoded_images_first() -> None:
     cameras = {key: ConvEncoder(3, (9, 9), channels=2, strides=(2,)) for key in ("front", "wrist")}
-    encoders = Encoders(cameras, {"proprio": IdentityEncoder(5)}, pad=4)
+    encoders = Encoders(cameras, {"proprio": VectorEncoder(5)}, pad=4)
     stack = torch.randint(0, 256, (2, 3, 9, 9, 1), dtype=torch.uint8)
     observation = {"proprio": torch.randn(2, 5), "wrist": stack, "front": 255 - stack}
     encoded = encoders(observation)

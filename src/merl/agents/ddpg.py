@@ -164,6 +164,7 @@ class DDPG:
     def learn(self, batch: Batch, draws: Draws) -> dict[str, Tensor]:
         """`update` with its random numbers given: augment and encode, critic, actor, target."""
         encoders = self.networks.encoders
+        encoders.observe(batch.observation)
         with self._arithmetic():
             encoded = encoders(batch.observation, draws.shifts)
             with torch.no_grad():

@@ -23,7 +23,7 @@ from gymnasium import spaces
 
 from merl.agents.ddpg import DDPG, DDPGConfig, Networks
 from merl.core import MerlError, check_choice, is_image, is_vector
-from merl.networks.encoders import ConvEncoder, IdentityEncoder, MLPEncoder
+from merl.networks.encoders import ConvEncoder, VectorEncoder
 from merl.networks.fusion import Fusion, Squash
 from merl.networks.heads import Actor, HeadSize, TwinCritic
 from merl.networks.initialization import orthogonal
@@ -55,6 +55,9 @@ class MERLConfig(DDPGConfig):
     """Strides of the image encoder's convolutions."""
     vector_encoder_dim: int = 0
     """Width of the MLP that encodes each vector; 0 is the identity (Figure 5)."""
+    standardize: bool = False
+    """Bring the numbers of a vector to one scale, by the mean and the deviation of the first
+    batches; the paper takes them as they are."""
     head_layers: int = 3
     """Linear layers of actor and critic, the output layer counted (paper: 3 for reach, else 6)."""
     hidden_dim: int = 1024
@@ -147,11 +150,9 @@ def _image_encoder(config: MERLConfig, space: spaces.Space[Any], stack: int) -> 
     return ConvEncoder(stack * channels, (height, width), config.conv_channels, config.conv_strides)
 
 
-def _vector_encoder(config: MERLConfig, space: spaces.Space[Any]) -> IdentityEncoder | MLPEncoder:
+def _vector_encoder(config: MERLConfig, space: spaces.Space[Any]) -> VectorEncoder:
     assert space.shape is not None
-    if config.vector_encoder_dim:
-        return MLPEncoder(space.shape[0], config.vector_encoder_dim)
-    return IdentityEncoder(space.shape[0])
+    return VectorEncoder(space.shape[0], config.vector_encoder_dim, config.standardize)
 
 
 def _keys(

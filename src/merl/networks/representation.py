@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from torch import Tensor, nn
 
 from merl.networks.augmentation import shift, to_input
+from merl.networks.encoders import ConvEncoder, VectorEncoder
 from merl.networks.names import module_name
 
 
@@ -25,14 +26,21 @@ class Encoders(nn.Module):
     """
 
     def __init__(
-        self, images: Mapping[str, nn.Module], vectors: Mapping[str, nn.Module], pad: int
+        self, images: Mapping[str, ConvEncoder], vectors: Mapping[str, VectorEncoder], pad: int
     ) -> None:
         super().__init__()
         self.image_keys, self.vector_keys = tuple(images), tuple(vectors)
         self.images = nn.ModuleDict({module_name(key): e for key, e in images.items()})
         self.vectors = nn.ModuleDict({module_name(key): e for key, e in vectors.items()})
         self.pad = pad
-        self.features = {key: int(e.features) for key, e in {**images, **vectors}.items()}  # type: ignore[arg-type]
+        self.features = {key: encoder.features for key, encoder in images.items()}
+        self.features |= {key: encoder.features for key, encoder in vectors.items()}
+
+    def observe(self, observation: Mapping[str, Tensor]) -> None:
+        """Take a batch's vectors into account for their scale, where one is kept."""
+        for key, encoder in zip(self.vector_keys, self.vectors.values(), strict=True):
+            assert isinstance(encoder, VectorEncoder)
+            encoder.observe(observation[key])
 
     def forward(
         self, observation: Mapping[str, Tensor], shifts: Mapping[str, Tensor] | None = None

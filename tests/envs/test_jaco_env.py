@@ -159,7 +159,10 @@ def test_actions_are_joint_velocities_and_clipped(blind):
         (np.full(9, np.nan), "not finite"),
         (np.array([np.inf] + [0.0] * 8), "not finite"),
         (["a"] * 9, "not an array of numbers"),
-        (None, "shape"),
+        (["0.1"] * 9, "not an array of numbers"),
+        (np.zeros(9, complex), "not an array of numbers"),
+        ([[0.0], [0.0, 1.0]], "not an array of numbers"),
+        (None, "not an array of numbers"),
     ],
 )
 def test_a_bad_action_moves_nothing(blind, action, message):
@@ -186,7 +189,10 @@ def test_a_bad_action_moves_nothing(blind, action, message):
         ("reach_duplo", {"image_size": 15}, "image_size is 15: .* at least 16"),
         ("reach_duplo", {"image_size": 84.0}, "image_size is 84.0"),
         ("reach_duplo", {"render_size": 0}, "render_size is 0"),
-        ("reach_duplo", {"observations": ()}, "observations is empty"),
+        ("reach_duplo", {"observations": ()}, r"observations is \(\): give a tuple"),
+        ("reach_duplo", {"observations": "image"}, "observations is 'image': give a tuple"),
+        ("reach_duplo", {"rendrer": "warp"}, "no setting 'rendrer': did you mean 'renderer'"),
+        ("reach_duplo", {"image_size": 5000}, "image_size is 5000: .* at most 2048"),
         ("reach_duplo", {"observations": ("sound",)}, "'sound' is unknown"),
         ("reach_duplo", {"renderer": "warp", "render_mode": "human"}, "render_mode 'human'"),
     ],

@@ -140,7 +140,8 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         except (TypeError, ValueError):
             values = None
         if values is None:
-            raise MerlError(f"action {action!r} is not an array of numbers")
+            shown = " ".join(repr(action).split())
+            raise MerlError(f"action {shown} is not an array of numbers")
         if values.shape != self.action_space.shape:
             raise MerlError(f"action has shape {values.shape}: {self.action_space.shape} is needed")
         if not np.isfinite(values).all():

@@ -6,6 +6,7 @@ import pytest
 import warp
 from dm_control import composer
 
+from episodes import Episodes, check_starts, check_uniform
 from merl.core import MerlError
 from merl.tasks import OCCLUDED, TASKS, jaco, make_task, rewards
 from merl.tasks.box import BOX_HALF_SIZE, BOX_MASS
@@ -13,26 +14,14 @@ from merl.tasks.box import BOX_HALF_SIZE, BOX_MASS
 BOX_TASKS = [("move_box", False), ("lift_box", False), ("move_box", True), ("lift_box", True)]
 
 
-class Episodes:
-    """A task, started in the way of `JacoEnv`: one physics for all episodes."""
-
-    def __init__(self, name, occluded=False):
-        self.name, self.occluded = name, occluded
-        self.task = make_task(name, occluded=occluded)
-        self.physics = self.task.compile()
-
-    def start(self, seed):
-        self.task.start_episode(self.physics, np.random.RandomState(seed))
-        return self.physics
-
-    def put_box(self, position):
-        self.physics.data.qpos[-7:] = (*position, 1.0, 0.0, 0.0, 0.0)
-        self.physics.forward()
-
-
 @pytest.fixture(scope="module", params=BOX_TASKS, ids=lambda p: p[0] + "-occluded" * p[1])
 def episodes(request):
     return Episodes(*request.param)
+
+
+def put_box(episodes, position):
+    episodes.physics.data.qpos[-7:] = (*position, 1.0, 0.0, 0.0, 0.0)
+    episodes.physics.forward()
 
 
 class Segmentation:
@@ -71,42 +60,13 @@ def box_geom(episodes):
     return int(episodes.physics.bind(episodes.task.prop.geom).element_id)
 
 
-def touching(physics, one, other):
-    return any(
-        {c.geom1, c.geom2} & one and {c.geom1, c.geom2} & other for c in physics.data.contact
-    )
-
-
-def check_starts(episodes, seeds):
-    task = episodes.task
-    yaws, closures = [], []
-    for seed in seeds:
-        physics = episodes.start(seed)
-        hand, box = task.tool_center_point(physics), task.prop_position(physics)
-        assert (hand >= np.array(jaco.HAND_SPAWN.lower) - 0.002).all()
-        assert (hand <= np.array(jaco.HAND_SPAWN.upper) + 0.002).all()
-        assert (np.abs(box[:2]) <= 0.101).all()
-        assert box[2] == pytest.approx(BOX_HALF_SIZE, abs=1e-3)
-        robot = set(physics.bind(task.arm.mjcf_model.find_all("geom")).element_id)
-        everything = set(range(physics.model.ngeom))
-        assert not touching(physics, robot, everything - robot)
-        w, _, _, z = physics.data.qpos[-4:]
-        yaws.append(2 * np.arctan2(z, w) % (2 * np.pi))
-        low, high = physics.bind(task.hand.joints).range.T
-        closures.append(((physics.bind(task.hand.joints).qpos - low) / (high - low)).mean())
-    return np.array(yaws), np.array(closures)
-
-
 def test_starts_lie_within_their_boxes_and_touch_nothing(episodes):
-    check_starts(episodes, range(10))
+    check_starts(episodes, range(10), BOX_HALF_SIZE)
 
 
 @pytest.mark.long
 def test_yaw_and_fingers_start_anywhere(episodes):
-    yaws, closures = check_starts(episodes, range(500))
-    for share in (yaws / (2 * np.pi), closures):
-        counts = np.histogram(share, bins=5, range=(0, 1))[0]
-        assert counts.min() > 60  # 100 in each of the five is expected
+    check_uniform(*check_starts(episodes, range(500), BOX_HALF_SIZE))
 
 
 def check_fast_starts(episodes, seeds):
@@ -155,13 +115,13 @@ def test_success_and_rewards_follow_the_distances(episodes):
     physics = episodes.start(1)
     for distance in draw.uniform(0.0, 0.15, 200):
         direction = draw.normal(size=3)
-        episodes.put_box(task.target + distance * direction / np.linalg.norm(direction))
+        put_box(episodes, task.target + distance * direction / np.linalg.norm(direction))
         assert task.distance(physics) == pytest.approx(distance, abs=1e-9)
         assert task.success(physics) == (task.distance(physics) <= 0.01)
     for distance in draw.uniform(0.0, 0.15, 200):
         direction = draw.normal(size=3)
         hand = task.tool_center_point(physics)
-        episodes.put_box(hand + distance * direction / np.linalg.norm(direction))
+        put_box(episodes, hand + distance * direction / np.linalg.norm(direction))
         assert task.hand_distance(physics) == pytest.approx(distance, abs=1e-9)
         terms = task.reward_terms(physics)
         assert tuple(terms) == task.term_names
@@ -184,7 +144,7 @@ def test_the_box_at_rest_can_succeed():
     """The target of move_box lies where a box on the floor can be."""
     episodes = Episodes("move_box")
     physics = episodes.start(0)
-    episodes.put_box((0.0, -0.2, 0.03))
+    put_box(episodes, (0.0, -0.2, 0.03))
     physics.step(200)
     assert episodes.task.success(physics)
 
@@ -196,7 +156,7 @@ def test_the_mark_is_seen_around_the_box_and_touches_nothing():
     assert physics.model.geom_rgba[mark, 3] == 1.0
     counter = Segmentation(physics, 84)
     alone = counter.pixels(mark)
-    episodes.put_box((0.01, -0.2, 0.025))
+    put_box(episodes, (0.01, -0.2, 0.025))
     behind = counter.pixels(mark)
     assert alone > 100
     assert 0.25 * alone < behind < 0.75 * alone

@@ -4,25 +4,14 @@ import numpy as np
 import pytest
 from dm_control import manipulation
 
+from episodes import Episodes, check_starts, check_uniform
 from merl.core import MerlError
-from merl.tasks import TASKS, ReachDuplo, jaco, simulator
-
-
-class Episodes:
-    """Our task, started in the way of `JacoEnv`: one physics for all episodes."""
-
-    def __init__(self):
-        self.task = ReachDuplo()
-        self.physics = self.task.compile()
-
-    def start(self, seed):
-        self.task.start_episode(self.physics, np.random.RandomState(seed))
-        return self.physics
+from merl.tasks import TASKS, ReachDuplo, simulator
 
 
 @pytest.fixture(scope="module")
 def ours():
-    return Episodes()
+    return Episodes("reach_duplo")
 
 
 @pytest.fixture(scope="module")
@@ -96,41 +85,13 @@ def test_reward_is_that_of_dm_control_at_every_distance(ours, theirs):
         assert ours.task.success(physics) == (ours.task.distance(physics) <= 0.05)
 
 
-def check_starts(ours, seeds):
-    """Each start lies within its box, at rest, and the hand touches nothing."""
-    task = ours.task
-    yaws, closures = [], []
-    for seed in seeds:
-        physics = ours.start(seed)
-        hand, brick = task.tool_center_point(physics), task.prop_position(physics)
-        assert (hand >= np.array(jaco.HAND_SPAWN.lower) - 0.002).all()
-        assert (hand <= np.array(jaco.HAND_SPAWN.upper) + 0.002).all()
-        assert (np.abs(brick[:2]) <= 0.101).all()
-        assert abs(brick[2]) < 1e-3
-        down = physics.bind(task.hand.tool_center_point).xmat.reshape(3, 3)[:, 2]
-        assert down[2] == pytest.approx(-1.0, abs=0.01)
-        of_hand = set(physics.bind(task.hand.mjcf_model.find_all("geom")).element_id)
-        of_brick = set(physics.bind(task.prop.mjcf_model.find_all("geom")).element_id)
-        for contact in physics.data.contact:
-            touching = {contact.geom1, contact.geom2}
-            assert not (touching & of_hand and touching & of_brick)
-        w, _, _, z = physics.data.qpos[-4:]
-        yaws.append(2 * np.arctan2(z, w) % (2 * np.pi))
-        low, high = physics.bind(task.hand.joints).range.T
-        closures.append(((physics.bind(task.hand.joints).qpos - low) / (high - low)).mean())
-    return np.array(yaws), np.array(closures)
-
-
 def test_starts_lie_within_their_boxes(ours):
-    check_starts(ours, range(30))
+    check_starts(ours, range(30), resting_height=0.0)
 
 
 @pytest.mark.long
 def test_yaw_and_fingers_start_anywhere(ours):
-    yaws, closures = check_starts(ours, range(500))
-    for share in (yaws / (2 * np.pi), closures):
-        counts = np.histogram(share, bins=5, range=(0, 1))[0]
-        assert counts.min() > 60  # 100 in each of the five is expected
+    check_uniform(*check_starts(ours, range(500), resting_height=0.0))
 
 
 def test_every_task_by_its_name():

@@ -1,0 +1,52 @@
+"""A task without an environment around it, for the tests of tasks and experts."""
+
+import numpy as np
+
+from merl.tasks import jaco, make_task
+
+
+class Episodes:
+    """A task, started in the way of `JacoEnv`: one physics for all episodes."""
+
+    def __init__(self, name, occluded=False):
+        self.name, self.occluded = name, occluded
+        self.task = make_task(name, occluded=occluded)
+        self.physics = self.task.compile()
+
+    def start(self, seed):
+        self.task.start_episode(self.physics, np.random.RandomState(seed))
+        return self.physics
+
+
+def check_starts(episodes, seeds, resting_height):
+    """Each start lies within its box, at rest, and the robot touches nothing.
+
+    Returns:
+        The object's yaw, rad, and how far the fingers are closed, of each start.
+    """
+    task = episodes.task
+    yaws, closures = [], []
+    for seed in seeds:
+        physics = episodes.start(seed)
+        hand, prop = task.tool_center_point(physics), task.prop_position(physics)
+        assert (hand >= np.array(jaco.HAND_SPAWN.lower) - 0.002).all()
+        assert (hand <= np.array(jaco.HAND_SPAWN.upper) + 0.002).all()
+        assert (np.abs(prop[:2]) <= 0.101).all()
+        assert abs(prop[2] - resting_height) < 1e-3
+        down = physics.bind(task.hand.tool_center_point).xmat.reshape(3, 3)[:, 2]
+        assert abs(down[2] + 1.0) < 0.01
+        robot = set(physics.bind(task.arm.mjcf_model.find_all("geom")).element_id)
+        for contact in physics.data.contact:
+            pair = {contact.geom1, contact.geom2}
+            assert not pair & robot or pair <= robot
+        w, _, _, z = physics.data.qpos[-4:]
+        yaws.append(2 * np.arctan2(z, w) % (2 * np.pi))
+        low, high = physics.bind(task.hand.joints).range.T
+        closures.append(((physics.bind(task.hand.joints).qpos - low) / (high - low)).mean())
+    return np.array(yaws), np.array(closures)
+
+
+def check_uniform(yaws, closures):
+    """500 yaws and closures, a hundred of which are expected in each fifth of their range."""
+    for share in (yaws / (2 * np.pi), closures):
+        assert np.histogram(share, bins=5, range=(0, 1))[0].min() > 60

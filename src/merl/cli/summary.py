@@ -17,6 +17,9 @@ from merl.training.config import TrainConfig
 from merl.training.evaluation import Evaluation, evaluate, make_run_env
 from merl.training.trainer import Outcome
 
+FLOORS = ("random actions", "no motion")
+"""The references that need no skill."""
+
 
 def summarize(outcome: Outcome, console: Console) -> None:
     """Print the table, draw the curve, say plainly what was learnt, and how to go on."""
@@ -36,7 +39,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
     videos = sorted(run.videos.glob("*.mp4")) if run.videos.is_dir() else []
     if videos:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
-    console.print(_verdict(beside[0], trained), highlight=False)
+    console.print(_verdict(beside, trained), highlight=False)
     console.print(_way_on(outcome), highlight=False, soft_wrap=True)
     console.print(
         f"(its replay, {run.replay}, is only needed to go on, and may be deleted otherwise)",
@@ -60,7 +63,7 @@ def random_reference(config: TrainConfig, episodes: int = 20) -> Reference:
         result = evaluate(act, env, episodes)
     finally:
         env.close()
-    return Reference("random actions", result.returns, result.success_end, f"{episodes} episodes")
+    return Reference(FLOORS[0], result.returns, result.success_end, f"{episodes} episodes")
 
 
 def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> Table:
@@ -80,11 +83,18 @@ def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> T
     return table
 
 
-def _verdict(chance: Reference, trained: Evaluation) -> str:
-    """Whether anything was learnt, as far as the intervals allow to say."""
-    if trained.returns.low > chance.returns.high:
-        return "It has begun to learn: its return lies clearly above that of random actions."
-    return "It is too early to say that it has learnt: its return is not clearly above random."
+def _verdict(beside: Sequence[Reference], trained: Evaluation) -> str:
+    """Whether anything was learnt, as far as the intervals allow to say.
+
+    Doing nothing can be paid more than acting at random.
+    """
+    floor = max((row for row in beside if row.name in FLOORS), key=lambda row: row.returns.high)
+    if trained.returns.low > floor.returns.high:
+        return f"It has begun to learn: its return lies clearly above that of {floor.name}."
+    return (
+        "It is too early to say that it has learnt: its return is not clearly above that of "
+        f"{floor.name}."
+    )
 
 
 def _way_on(outcome: Outcome) -> str:

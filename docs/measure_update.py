@@ -16,7 +16,7 @@ import torch
 from merl.agents.merl import make_merl
 from merl.envs import make_env
 from merl.experiments.presets import PRESETS
-from merl.training.timing import _random_batch
+from merl.training.timing import random_batch
 
 REPEATS = 30
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -48,7 +48,7 @@ def main() -> None:
         learner = make_merl(
             agent, space, actions, frame_stack=3, seed=0, device=torch.device("cpu")
         )
-        prepared[name] = learner, _random_batch(config, space, actions)
+        prepared[name] = learner, random_batch(config, space, actions)
     seconds: dict[str, list[float]] = {name: [] for name in prepared}
     for repeat in range(REPEATS + 2):
         for name, (learner, batch) in prepared.items():

@@ -41,7 +41,7 @@ def episode(env, steps=5, action_seed=0, **reset):
     [
         ("reach_duplo", {"proprio": "paper"}),
         ("reach_duplo", {"proprio": "full"}),
-        ("move_box", {"proprio": "paper"}),
+        ("move_box", {"proprio": "paper", "state": "relative"}),
         ("lift_box", {"proprio": "full", "occluded": True}),
     ],
 )
@@ -249,6 +249,7 @@ def test_every_setting_is_a_plain_value():
         "renderer": "gl",
         "image_size": 84,
         "proprio": "paper",
+        "state": "absolute",
         "observations": ("image", "proprio"),
         "occluded": False,
         "render_size": 480,

@@ -80,7 +80,7 @@ def test_vectors_are_brought_to_one_scale() -> None:
     seen = torch.cat(batches)
     assert encoder.scale is not None
     torch.testing.assert_close(encoder.scale.mean, seen.mean(0))
-    torch.testing.assert_close(encoder.scale.square, seen.square().mean(0))
+    torch.testing.assert_close(encoder.scale.variance, seen.var(0, correction=0))
     encoded = encoder(vectors(10_000))
     assert encoded.std(0)[:2] == pytest.approx(torch.ones(2), rel=0.1)
     assert encoded.mean(0) == pytest.approx(torch.zeros(4), abs=0.15)
@@ -97,6 +97,20 @@ def test_the_scale_stays_once_it_has_seen_enough() -> None:
     scale.observe(torch.full((1000, 1), 50.0))
     for name, value in scale.state_dict().items():
         assert torch.equal(value, before[name])
+
+
+def test_the_scale_is_right_far_from_zero() -> None:
+    scale = Standardize(1)
+    vectors = 1e4 + torch.randn(10, 500, 1, generator=torch.Generator().manual_seed(0))
+    for batch in vectors:
+        scale.observe(batch)
+    assert scale(vectors.flatten(0, 1)).std() == pytest.approx(1, rel=0.01)
+
+
+def test_what_lies_far_off_is_brought_near() -> None:
+    scale = Standardize(2)
+    scale.observe(torch.zeros(100, 2))
+    assert scale(torch.tensor([[0.02, 3.0], [-1.0, 0.0]])).tolist() == [[2, 5], [-5, 0]]
 
 
 def test_the_mlp_has_two_layers_and_ends_in_a_relu() -> None:

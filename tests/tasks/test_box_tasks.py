@@ -108,6 +108,10 @@ def test_box_and_target(episodes):
     np.testing.assert_allclose(state[42:45], task.prop_position(physics), atol=1e-6)
     np.testing.assert_array_equal(state[-3:], np.float32(target))
     np.testing.assert_array_equal(state[:42], task.proprio(physics, "full"))
+    relative = task.state(physics, "relative")
+    np.testing.assert_array_equal(relative[:58], state)
+    np.testing.assert_allclose(state[30:33] + relative[58:61], state[42:45], atol=1e-6)
+    np.testing.assert_allclose(state[42:45] + relative[61:], state[55:58], atol=1e-6)
 
 
 def test_success_and_rewards_follow_the_distances(episodes):

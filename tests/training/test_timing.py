@@ -7,7 +7,7 @@ import torch
 
 from merl.agents.merl import MERLConfig
 from merl.replay import ReplayConfig
-from merl.training.config import TrainConfig
+from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.timing import Arithmetic, Timing, measure
 from toy import DotEnv
 
@@ -34,6 +34,24 @@ def test_the_time_of_a_run_counts_updates_steps_and_evaluations() -> None:
     assert timing.seconds(config) == 400 * 0.5 + (1000 + evaluated) * 0.25
     assert timing.seconds(config, done=900) == 50 * 0.5 + (100 + evaluated) * 0.25
     assert timing.seconds(dataclasses.replace(config, minutes=1.0)) == 60
+
+
+def test_the_time_of_a_run_counts_its_videos() -> None:
+    timing = Timing({FP32: 0.0}, 0.0, frame=0.01)
+    seconds = {}
+    for video in ("each", "last", "none"):
+        evaluation = EvaluationConfig(every=250, video=video)
+        seconds[video] = timing.seconds(dataclasses.replace(CONFIG, eval=evaluation))
+    assert seconds == {"each": pytest.approx(4 * 2.5), "last": pytest.approx(2.5), "none": 0}
+
+
+def test_a_frame_is_timed_where_videos_are_made() -> None:
+    env, eval_env = DotEnv(), DotEnv()
+    env.length = 10_000
+    none = dataclasses.replace(CONFIG, eval=EvaluationConfig(video="none"))
+    for config, filmed in ((CONFIG, True), (none, False)):
+        timing = measure(config, env, eval_env, env.observation_space, torch.device("cpu"))
+        assert (timing.frame > 0) == filmed
 
 
 @pytest.mark.parametrize(

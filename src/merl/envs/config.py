@@ -9,6 +9,7 @@ from merl.core import MerlError, check_choice
 
 RendererName = Literal["gl", "warp"]
 ProprioName = Literal["paper", "full"]
+StateName = Literal["absolute", "relative"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 
@@ -28,6 +29,10 @@ class EnvConfig:
     """What the robot feels: `paper` (angles and velocities of arm and fingers, 24 numbers) or
     `full` (also joint torques and the hand's position and rotation, 42 numbers)."""
 
+    state: StateName = "absolute"
+    """What `state` holds: `absolute` (`full` proprioception, the object's pose and velocities, the
+    target) or `relative` (also the ways from hand to object and from object to target)."""
+
     observations: tuple[str, ...] = ("image", "proprio")
     """What an observation holds: any of `image`, `proprio`, `state`. The rest is not computed."""
 
@@ -41,6 +46,7 @@ class EnvConfig:
     def __post_init__(self) -> None:
         check_choice("renderer", self.renderer, get_args(RendererName))
         check_choice("proprio", self.proprio, get_args(ProprioName))
+        check_choice("state", self.state, get_args(StateName))
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
                 f"observations is {self.observations!r}: give a tuple of at least one of "

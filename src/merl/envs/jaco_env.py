@@ -55,7 +55,8 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         low, high = self._physics.model.actuator_ctrlrange.T
         self._action_center, self._action_scale = (high + low) / 2, (high - low) / 2
         self.action_space = spaces.Box(-1.0, 1.0, low.shape, np.float32)
-        self.observation_space = _observation_space(config, self.task.state(self._physics).size)
+        state_size = self.task.state(self._physics, config.state).size
+        self.observation_space = _observation_space(config, state_size)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -159,7 +160,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if "proprio" in wanted:
             observation["proprio"] = self.task.proprio(self._physics, self.config.proprio)
         if "state" in wanted:
-            observation["state"] = self.task.state(self._physics)
+            observation["state"] = self.task.state(self._physics, self.config.state)
         return observation
 
     def _info(self, terms: dict[str, float]) -> dict[str, Any]:

@@ -57,7 +57,9 @@ class Standardize(nn.Module):
     """A vector with its mean taken off and divided by its standard deviation, number by number.
 
     Raw, a velocity of 5 rad/s drowns a position of 5 cm. Mean and deviation are those of what
-    `observe` was given until it has seen `STEADY` samples; then they stay.
+    `observe` was given until it has seen `STEADY` samples; then they stay. What lies further than
+    `FARTHEST` deviations off is brought there: what rests most of the time, as an object does, is
+    hundreds of them away when it is touched, and would drown everything else (docs/tasks.md).
 
     Args:
         features: length of the vector.
@@ -65,14 +67,15 @@ class Standardize(nn.Module):
 
     STEADY = 100_000
     SMALLEST = 0.01  # deviation: what has hardly varied so far may vary later
+    FARTHEST = 5.0  # deviations
     mean: Tensor
-    square: Tensor
+    variance: Tensor
     count: Tensor
 
     def __init__(self, features: int) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(features))
-        self.register_buffer("square", torch.ones(features))  # mean of the squares
+        self.register_buffer("variance", torch.ones(features))
         self.register_buffer("count", torch.zeros(()))
 
     @torch.no_grad()
@@ -81,13 +84,15 @@ class Standardize(nn.Module):
         wanted = self.count < self.STEADY
         self.count += len(vector) * wanted
         share = wanted * len(vector) / self.count
-        self.mean.lerp_(vector.mean(0), share)
-        self.square.lerp_(vector.square().mean(0), share)
+        variance, mean = torch.var_mean(vector, dim=0, correction=0)
+        apart = mean - self.mean
+        self.variance.lerp_(variance, share).add_(share * (1 - share) * apart.square())
+        self.mean.add_(share * apart)
 
     def forward(self, vector: Tensor) -> Tensor:
-        """(B, n) to (B, n)."""
-        variance = (self.square - self.mean.square()).clamp(min=self.SMALLEST**2)
-        return (vector - self.mean) * variance.rsqrt()
+        """(B, n) to (B, n), in [-5, 5]."""
+        scale = self.variance.clamp(min=self.SMALLEST**2).rsqrt()
+        return ((vector - self.mean) * scale).clamp(-self.FARTHEST, self.FARTHEST)
 
 
 class VectorEncoder(nn.Module):

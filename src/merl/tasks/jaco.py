@@ -30,6 +30,7 @@ CAMERA = cameras.FRONT_CLOSE
 """The fixed camera in front of the arm: its name, position (m) and axes (dm_control)."""
 
 ProprioSet = Literal["paper", "full"]
+StateSet = Literal["absolute", "relative"]
 PROPRIO_SIZES: dict[ProprioSet, int] = {"paper": 24, "full": 42}
 """How many numbers each set of proprioception has; see `JacoTask.proprio`."""
 _POSE_AND_VELOCITY = ("position", "orientation", "linear_velocity", "angular_velocity")
@@ -217,17 +218,28 @@ class JacoTask(composer.Task):  # type: ignore[misc]
             ]
         return np.concatenate(parts, dtype=np.float32, casting="same_kind")
 
-    def state(self, physics: mjcf.Physics) -> Float32:
+    def state(self, physics: mjcf.Physics, which: StateSet = "absolute") -> Float32:
         """All that matters, for agents without a camera.
 
+        Args:
+            physics: the simulation.
+            which: `absolute`: `full` proprioception (42), the object's position in m (3),
+                orientation as a unit quaternion (4), and linear and angular velocity in m/s and
+                rad/s (6), and where there is one the target's position in m (3). `relative`: also
+                the way from the tool centre point to the object (3), and from the object to the
+                target where there is one (3), in m.
+
         Returns:
-            float32 (55,) or (58,): `full` proprioception (42), the object's position in m (3),
-            orientation as a unit quaternion (4), and linear and angular velocity in m/s and
-            rad/s (6), and where there is one the target's position in m (3).
+            float32, (55,) and (58,) without a target, (58,) and (64,) with one.
         """
         parts = [self.proprio(physics, "full"), physics.data.sensordata[self._prop_sensors]]
         if self.target is not None:
             parts.append(self.target)
+        if which == "relative":
+            prop = self.prop_position(physics)
+            parts.append(prop - self.tool_center_point(physics))
+            if self.target is not None:
+                parts.append(self.target - prop)
         return np.concatenate(parts, dtype=np.float32, casting="same_kind")
 
     @abstractmethod

@@ -89,7 +89,7 @@ def measure(
         ("fp32", "bf16") if asked == "auto" else (asked,)
     )
     assert isinstance(env.action_space, spaces.Box)
-    batch = _random_batch(config, space, env.action_space)  # as from replay: not on the device yet
+    batch = random_batch(config, space, env.action_space)  # as from replay: not on the device yet
     update: dict[Arithmetic, float] = {}
 
     def attempt(arithmetic: Arithmetic) -> DDPG:
@@ -106,6 +106,30 @@ def measure(
     torch.set_num_threads(threads)
     frame = 0.0 if config.eval.video == "none" else _time_frame(eval_env)
     return Timing(update, _time_step(env) + _time_acting(agent, batch), frame)
+
+
+def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:
+    """A batch such as replay would give, of noise: always the same for the same config."""
+    generator = torch.Generator().manual_seed(0)
+    size, stack = config.replay.batch_size, config.replay.frame_stack
+
+    def observation() -> dict[str, torch.Tensor]:
+        return {key: modality(box) for key, box in space.items()}
+
+    def modality(box: spaces.Space[Any]) -> torch.Tensor:
+        assert box.shape is not None
+        if is_image(box):
+            shape = (size, stack, *box.shape)
+            return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
+        return torch.randn((size, *box.shape), generator=generator)
+
+    return Batch(
+        observation(),
+        torch.rand((size, *actions.shape), generator=generator) * 2 - 1,
+        torch.rand(size, generator=generator),
+        torch.full((size,), 0.97),
+        observation(),
+    )
 
 
 def _agent(
@@ -167,26 +191,3 @@ def _median_seconds(work: Callable[[], object]) -> float:
         work()
         seconds.append(time.perf_counter() - start)
     return median(seconds)
-
-
-def _random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:
-    generator = torch.Generator().manual_seed(0)
-    size, stack = config.replay.batch_size, config.replay.frame_stack
-
-    def observation() -> dict[str, torch.Tensor]:
-        return {key: modality(box) for key, box in space.items()}
-
-    def modality(box: spaces.Space[Any]) -> torch.Tensor:
-        assert box.shape is not None
-        if is_image(box):
-            shape = (size, stack, *box.shape)
-            return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
-        return torch.randn((size, *box.shape), generator=generator)
-
-    return Batch(
-        observation(),
-        torch.rand((size, *actions.shape), generator=generator) * 2 - 1,
-        torch.rand(size, generator=generator),
-        torch.full((size,), 0.97),
-        observation(),
-    )

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium
 import torch
 
-from merl.agents.merl import make_merl
+from merl.agents import make_agent
 from merl.envs import make_env
 from merl.experiments.presets import PRESETS
 from merl.training.timing import random_batch
@@ -45,7 +45,7 @@ def main() -> None:
         others = {key: value for key, value in changes.items() if key != "batch_size"}
         agent = dataclasses.replace(config.agent, precision="bf16", **others)
         config = dataclasses.replace(config, replay=replay, agent=agent)
-        learner = make_merl(
+        learner = make_agent(
             agent, space, actions, frame_stack=3, seed=0, device=torch.device("cpu")
         )
         prepared[name] = learner, random_batch(config, space, actions)

@@ -118,7 +118,18 @@ class Batch:
 
 
 class Agent(Protocol):
-    """What the training loop asks of a learner."""
+    """What the training loop asks of a learner.
+
+    Attributes:
+        step: environment steps so far, on which exploration may depend; set by who drives it.
+    """
+
+    step: int
+
+    @property
+    def senses(self) -> tuple[str, ...]:
+        """The keys of an observation that it acts on."""
+        ...
 
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
         """Actions (B, A) in [-1, 1] for stacked observations, with exploration noise or without."""

@@ -7,13 +7,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import pytest
 import reference
 import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
+from merl.agents import make_agent
+from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG, Draws
-from merl.agents.merl import MERLConfig, make_merl
 from merl.core import Batch
 
 STACK = 3
@@ -26,12 +28,13 @@ class Case:
     """What is learnt from: the modalities' shapes, and how MERL is configured."""
 
     name: str
-    config: MERLConfig
+    config: AgentConfig
     images: Mapping[str, tuple[int, int, int]] = field(
         default_factory=lambda: {"image": (24, 28, 3)}
     )
     vectors: Mapping[str, int] = field(default_factory=lambda: {"proprio": 7})
     batch: int = 8
+    step: int = 0
 
     @property
     def observation_space(self) -> spaces.Dict:
@@ -51,25 +54,32 @@ class Case:
             strides=c.conv_strides,
             vector_layers=2 if c.vector_encoder_dim else 0,
             layers=c.head_layers,
+            head_norm=c.head_norm,
+            fused=c.latent_dim > 0,
+            fusion_norm=c.fusion_norm,
+            shared={"decoupled": "", "shared": "critic", "shared_by_both": "both"}[c.fusion],
+            critic_alone=c.critic_vectors,
             squash=c.squash,
             pad=c.shift_pad,
-            sigma=c.noise_std,
+            sigma=c.noise(self.step),
             clip=c.noise_clip,
             tau=c.tau,
             learning_rate=c.learning_rate,
             averaged=(*fusion, "phi_1", "phi_2"),
         )
 
-    def agent(self, seed: int = 0) -> DDPG:
+    def agent(self, seed: int = 0, actions: int = ACTIONS) -> DDPG:
         """As the package makes it."""
-        return make_merl(
+        agent = make_agent(
             self.config,
             self.observation_space,
-            spaces.Box(-1, 1, (ACTIONS,), np.float32),
+            spaces.Box(-1, 1, (actions,), np.float32),
             frame_stack=STACK,
             seed=seed,
             device=torch.device("cpu"),
         )
+        agent.step = self.step
+        return agent
 
     def batch_of(self, seed: int, dtype: torch.dtype = torch.float32) -> Batch:
         """Pictures that are smooth but for their grain, and discounts of both kinds."""
@@ -110,6 +120,10 @@ class Case:
             return torch.randn(self.batch, ACTIONS, generator=generator).to(dtype)
 
         return reference.Chance(shifts(), shifts(), noise(), noise())
+
+
+def named_cases(*cases: Case) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
 
 
 def _pictures(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -211,7 +225,7 @@ def state_of(agent: DDPG) -> reference.State:
     """The agent's state as the reference's, before or after its first update."""
     weights = weights_of(agent)
     if not agent.critic_optimizer.state:
-        return reference.start(weights)
+        return reference.start(weights, reference.Spec())
     critic, actor = (
         moments_of(optimizer, agent)
         for optimizer in (agent.critic_optimizer, agent.actor_optimizer)
@@ -232,11 +246,13 @@ def sample_of(batch: Batch) -> reference.Sample:
     )
 
 
-def draws_of(chance: reference.Chance, config: MERLConfig, dtype: torch.dtype) -> Draws:
+def draws_of(
+    chance: reference.Chance, config: AgentConfig, dtype: torch.dtype, step: int = 0
+) -> Draws:
     """The package takes its noise scaled and clipped."""
 
     def clipped(noise: Tensor) -> Tensor:
-        sigma, c = config.noise_std, config.noise_clip
+        sigma, c = config.noise(step), config.noise_clip
         return (sigma * noise).clamp(-c, c).to(dtype)
 
     return Draws(

@@ -38,6 +38,11 @@ class Spec:
     strides: tuple[int, ...] = (2, 1, 1, 1)
     vector_layers: int = 0  # 0 is the identity, which the final version of MERL uses
     layers: int = 3  # of the actor and of each Q, the output layer counted
+    head_norm: bool = True
+    fused: bool = True  # without, the heads see the encodings side by side
+    fusion_norm: bool = True
+    shared: str = ""  # "" or whose loss moves the one fusion: "critic", "both"
+    critic_alone: tuple[str, ...] = ()  # modalities that the actor does not have
     squash: str = "tanh"  # or "simplex"
     simplex_group: int = 8
     pad: int = 4
@@ -181,33 +186,41 @@ def encode(w: Weights, o: Modalities, shift: dict[str, Tensor], spec: Spec) -> M
 
 def h(w: Weights, psi: str, r: Modalities, spec: Spec) -> Tensor:
     """C.1's fusion: for each modality one layer, LayerNorm, tanh; then concatenated, (B, d)."""
+    keys = [k for k in spec.modalities if psi != "psi_actor" or k not in spec.critic_alone]
+    if not spec.fused:
+        return torch.cat([r[key] for key in keys], -1)
+    if spec.shared and psi == "psi_actor":
+        psi = "psi_critic"
 
     def one(key: str) -> Tensor:
-        x = layer_norm(w, f"{psi}.{key}.norm", linear(w, f"{psi}.{key}", r[key]))
+        x = linear(w, f"{psi}.{key}", r[key])
+        if spec.fusion_norm:
+            x = layer_norm(w, f"{psi}.{key}.norm", x)
         return tanh(x) if spec.squash == "tanh" else simplex(x, spec.simplex_group)
 
-    return torch.cat([one(key) for key in spec.modalities], -1)
+    return torch.cat([one(key) for key in keys], -1)
 
 
 # -- section 4.2: pi and Q -----------------------------------------------------------------------
 
 
-def mlp(w: Weights, name: str, x: Tensor, layers: int) -> Tensor:
+def mlp(w: Weights, name: str, x: Tensor, spec: Spec) -> Tensor:
     """C.1: LayerNorm and ReLU after each layer except the last."""
-    for i in range(1, layers):
-        x = relu(layer_norm(w, f"{name}.{i}.norm", linear(w, f"{name}.{i}", x)))
-    return linear(w, f"{name}.{layers}", x)
+    for i in range(1, spec.layers):
+        x = linear(w, f"{name}.{i}", x)
+        x = relu(layer_norm(w, f"{name}.{i}.norm", x) if spec.head_norm else x)
+    return linear(w, f"{name}.{spec.layers}", x)
 
 
 def pi(w: Weights, r_mm: Tensor, noise: Tensor, spec: Spec) -> Tensor:
     """pi_theta(r) + epsilon, epsilon ~ clip(N(0, sigma^2), -c, c); actions live in [-1, 1]."""
     epsilon = (spec.sigma * noise).clamp(-spec.clip, spec.clip)
-    return clamp_straight_through(tanh(mlp(w, "theta", r_mm, spec.layers)) + epsilon)
+    return clamp_straight_through(tanh(mlp(w, "theta", r_mm, spec)) + epsilon)
 
 
 def q(w: Weights, phi: str, r_mm: Tensor, a: Tensor, spec: Spec) -> Tensor:
     """Q_phi(r, a), (B,)."""
-    return mlp(w, phi, torch.cat([r_mm, a], -1), spec.layers).squeeze(-1)
+    return mlp(w, phi, torch.cat([r_mm, a], -1), spec).squeeze(-1)
 
 
 # -- equations 1 and 2 ---------------------------------------------------------------------------
@@ -233,9 +246,9 @@ def critic_loss(w: Weights, r: Modalities, a: Tensor, y: Tensor, spec: Spec) -> 
 
 
 def actor_loss(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> Tensor:
-    """Equation 2."""
+    """Equation 2; what the critic sees of o_t is a constant, also where its fusion learns here."""
     a = pi(w, h(w, "psi_actor", r, spec), noise, spec)
-    r_mm = h(w, "psi_critic", r, spec)
+    r_mm = h(w, "psi_critic", r, spec).detach()
     return -torch.minimum(q(w, "phi_1", r_mm, a, spec), q(w, "phi_2", r_mm, a, spec)).mean()
 
 
@@ -243,6 +256,11 @@ def actor_loss(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> Tensor:
 
 CRITIC_LEARNS = ("xi", "zeta", "psi_critic", "phi_1", "phi_2")
 ACTOR_LEARNS = ("psi_actor", "theta")
+
+
+def actor_learns(spec: Spec) -> tuple[str, ...]:
+    """What the actor's loss moves; a fusion that both use may be moved by both losses."""
+    return ("psi_critic", "theta") if spec.shared == "both" else ACTOR_LEARNS
 
 
 def of(weights: Iterable[str], symbols: Iterable[str]) -> list[str]:
@@ -294,18 +312,19 @@ def update(state: State, sample: Sample, chance: Chance, spec: Spec) -> tuple[St
 
     loss_1, g_1 = eq_1(w), gradients(eq_1, w, of(w, CRITIC_LEARNS))
     w, critic_adam = adam(w, state.critic_adam, g_1, spec.learning_rate)
-    w = average(w, spec)
 
     def eq_2(w: Weights) -> Tensor:
         return actor_loss(w, features, chance.noise, spec)
 
-    loss_2, g_2 = eq_2(w), gradients(eq_2, w, of(w, ACTOR_LEARNS))
+    loss_2, g_2 = eq_2(w), gradients(eq_2, w, of(w, actor_learns(spec)))
     w, actor_adam = adam(w, state.actor_adam, g_2, spec.learning_rate)
+    # Last, as in DrQ-v2: it matters only where the actor's loss moves what has an average.
+    w = average(w, spec)
 
     return State(w, critic_adam, actor_adam), Report(y, loss_1, loss_2, g_1 | g_2)
 
 
-def start(weights: Weights) -> State:
+def start(weights: Weights, spec: Spec) -> State:
     """Adam before its first step."""
 
     def zeros(symbols: tuple[str, ...]) -> Moments:
@@ -316,4 +335,4 @@ def start(weights: Weights) -> State:
             {name: torch.zeros_like(weights[name]) for name in names},
         )
 
-    return State(dict(weights), zeros(CRITIC_LEARNS), zeros(ACTOR_LEARNS))
+    return State(dict(weights), zeros(CRITIC_LEARNS), zeros(actor_learns(spec)))

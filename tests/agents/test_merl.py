@@ -9,8 +9,10 @@ import pytest
 import torch
 from gymnasium import spaces
 
+from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
-from merl.agents.merl import MERLConfig, make_merl, modalities
+from merl.agents.merl import MERLConfig
+from merl.agents.networks import modalities
 from merl.core import Batch, MerlError
 
 SPACE = spaces.Dict(
@@ -25,7 +27,7 @@ SPACE = spaces.Dict(
 def make(config: MERLConfig, space: spaces.Dict = SPACE) -> DDPG:
     action_space = spaces.Box(-1, 1, (9,), np.float32)
     device = torch.device("cpu")
-    return make_merl(config, space, action_space, frame_stack=3, seed=0, device=device)
+    return make_agent(config, space, action_space, frame_stack=3, seed=0, device=device)
 
 
 def test_table_1() -> None:
@@ -90,7 +92,7 @@ def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str
         ("tau", 1.01),
         ("noise_std", -0.1),
         ("noise_clip", -0.1),
-        ("latent_dim", 0),
+        ("latent_dim", -1),
         ("hidden_dim", 0),
         ("head_layers", 0),
         ("conv_channels", 0),

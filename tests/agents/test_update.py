@@ -16,6 +16,7 @@ from bridge import (
     errors,
     gradients_of,
     moments_of,
+    named_cases,
     sample_of,
     state_of,
     warm,
@@ -24,10 +25,13 @@ from bridge import (
 )
 from torch import Tensor
 
-from merl.agents.ddpg import DDPG
+from merl.agents.ddpg import DDPG, DDPGConfig
+from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
 
-SMALL = MERLConfig(latent_dim=48, conv_channels=8, hidden_dim=32, precision="fp32")
+SIZES = {"conv_channels": 8, "hidden_dim": 32, "precision": "fp32"}
+SMALL = MERLConfig(latent_dim=48, **SIZES)
+STATE = {"state": 9}
 TWO_CAMERAS = {"front": (24, 28, 3), "wrist": (26, 20, 1)}
 
 CASES = [
@@ -39,6 +43,29 @@ CASES = [
     Case("two-cameras", SMALL, images=TWO_CAMERAS),
     Case("two-vectors", SMALL, vectors={"joints": 5, "touch": 2}),
     Case("simplex", replace(SMALL, squash="simplex")),
+    Case("without-fusion-norm", replace(SMALL, fusion_norm=False)),
+    Case("without-head-norm", replace(SMALL, head_norm=False)),
+    Case("without-fusion", replace(SMALL, latent_dim=0)),
+    Case("shared-fusion", replace(SMALL, fusion="shared")),
+    Case("fusion-shared-by-both", replace(SMALL, fusion="shared_by_both")),
+    Case(
+        "shared-and-averaged",
+        replace(SMALL, fusion="shared_by_both", target="heads_and_fusion", head_layers=4),
+    ),
+    Case(
+        "informed-critic",
+        replace(SMALL, critic_vectors=("state",)),
+        vectors={"proprio": 7, "state": 9},
+    ),
+    Case(
+        "noise-on-its-way-down",
+        replace(SMALL, noise_std=1.0, noise_std_end=0.1, noise_steps=1000),
+        step=400,
+    ),
+    Case("proprio", replace(SMALL, images=()), images={}),
+    Case("merl-state", replace(SMALL, images=(), vectors=("state",)), images={}, vectors=STATE),
+    Case("drqv2", replace(DrQV2Config(), **SIZES, latent_dim=50), vectors={}, step=250_000),
+    Case("ddpg", replace(DDPGConfig(), **SIZES), images={}, vectors=STATE),
     Case(
         "other-numbers",
         replace(SMALL, tau=0.3, noise_std=0.5, noise_clip=0.4, shift_pad=2, learning_rate=3e-3),
@@ -61,10 +88,6 @@ PAPER_3, PAPER_6 = (
 )
 
 
-def named_cases(*cases: Case) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
-
-
 def prepared(case: Case, dtype: torch.dtype) -> DDPG:
     """An agent in mid-training: nothing in it is zero, one, or equal to something else."""
     agent = case.agent()
@@ -76,7 +99,7 @@ def prepared(case: Case, dtype: torch.dtype) -> DDPG:
 
 
 def learn(agent: DDPG, case: Case, seed: int, dtype: torch.dtype) -> dict[str, Tensor]:
-    draws = draws_of(case.chance_of(seed), case.config, dtype)
+    draws = draws_of(case.chance_of(seed), case.config, dtype, case.step)
     return agent.learn(case.batch_of(seed, dtype), draws)
 
 

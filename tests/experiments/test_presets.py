@@ -1,18 +1,18 @@
-"""Presets are values: the paper's numbers, and what a task changes in them."""
-
-import dataclasses
+"""Presets are values: the paper's numbers, what a task changes in them, and what an agent does."""
 
 import pytest
 
-from merl.experiments.presets import ABOUT, PRESETS, preset_for
+from merl.agents import AGENTS
+from merl.core import MerlError
+from merl.experiments.presets import PRESETS, PUBLISHED, compose
 from merl.training.config import TrainConfig
 
 
 def test_preset_paper_is_table_1() -> None:
-    config = PRESETS["paper"]
-    assert config == TrainConfig(config.task)  # every default is the paper's
+    config = compose("paper", "reach_duplo")
+    assert config == TrainConfig("reach_duplo")  # every default is the paper's
     assert (config.steps, config.random_steps, config.seed_steps) == (1_000_000, 2000, 4000)
-    assert config.updates_per_step == 1
+    assert (config.updates_per_step, config.action_repeat) == (1, 1)
     assert (config.env.renderer, config.env.image_size, config.env.proprio) == ("gl", 84, "paper")
     replay = config.replay
     assert (replay.capacity, replay.batch_size, replay.frame_stack) == (1_000_000, 256, 3)
@@ -26,14 +26,44 @@ def test_preset_paper_is_table_1() -> None:
 
 @pytest.mark.parametrize(("task", "layers"), [("reach_duplo", 3), ("move_box", 6), ("lift_box", 6)])
 def test_the_heads_of_preset_paper_follow_the_task(task: str, layers: int) -> None:
-    config = preset_for("paper", task)
-    assert config.agent.head_layers == layers
-    agent = dataclasses.replace(config.agent, head_layers=3)
-    assert dataclasses.replace(config, agent=agent) == PRESETS["paper"]
-    for name in ("laptop", "state", "smoke"):
-        assert preset_for(name, task) is PRESETS[name]
+    assert compose("paper", task).agent.head_layers == layers
+    assert compose("laptop", task).agent.head_layers == 3
 
 
-def test_every_preset_says_what_it_is_for() -> None:
-    assert ABOUT.keys() == PRESETS.keys()
-    assert all(config.preset == name for name, config in PRESETS.items())
+def test_every_preset_takes_every_agent() -> None:
+    for preset, chosen in PRESETS.items():
+        assert compose(preset, "lift_box").agent_name == chosen.agent_name
+        for name, agent in AGENTS.items():
+            config = compose(preset, "lift_box", name)
+            assert (config.preset, config.agent_name) == (preset, name)
+            assert type(config.agent) is type(agent)
+            assert (config.agent.images, config.agent.vectors) == (agent.images, agent.vectors)
+            for field, value in chosen.agent.items():
+                assert getattr(config.agent, field) == value
+
+
+def test_published_is_what_the_authors_ran() -> None:
+    drqv2 = compose("paper", "reach_duplo", "drqv2", "published")
+    assert (drqv2.action_repeat, drqv2.updates_per_step) == (2, 0.25)
+    assert drqv2.agent == AGENTS["drqv2"]
+    assert (drqv2.agent.noise(0), drqv2.agent.noise(250_000)) == (1.0, pytest.approx(0.55))
+    assert drqv2.agent.noise(10**7) == pytest.approx(0.1)
+    sac = compose("state", "reach_duplo", "sac", "published")
+    assert (sac.replay.n_step, sac.agent.learning_rate, sac.agent.tau) == (1, 3e-4, 0.005)
+    for name in PUBLISHED:
+        assert compose("laptop", "x", name, "published").setting == "published"
+        assert compose("laptop", "x", name).setting == "matched"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("labtop", "x"), "did you mean 'laptop'"),
+        (("laptop", "x", "drq"), "did you mean 'drqv2'"),
+        (("laptop", "x", "drqv2", "publshed"), "did you mean 'published'"),
+        (("laptop", "x", "merl", "published"), "'merl' has no setting published"),
+    ],
+)
+def test_what_there_is_not(arguments: tuple, says: str) -> None:  # type: ignore[type-arg]
+    with pytest.raises(MerlError, match=says):
+        compose(*arguments)

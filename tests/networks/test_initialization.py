@@ -1,4 +1,4 @@
-"""Orthogonal weights, biases at zero (C.1), as MERL's networks come out of `make_merl`."""
+"""Orthogonal weights, biases at zero (C.1), as MERL's networks come out of `make_agent`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from merl.agents.merl import MERLConfig, make_networks
+from merl.agents.merl import MERLConfig
+from merl.agents.networks import make_networks
 from merl.networks.initialization import orthogonal
 
 

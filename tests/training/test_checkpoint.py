@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
-from merl.agents.merl import MERLConfig, make_merl
+from merl.agents.merl import MERLConfig
 from merl.core import MerlError
 from merl.training.checkpoint import Checkpoint, load_agent, save
 from toy import DotEnv
@@ -18,7 +19,7 @@ CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")
 
 def agent(seed: int = 0, config: MERLConfig = CONFIG) -> DDPG:
     env = DotEnv()
-    return make_merl(
+    return make_agent(
         config,
         env.observation_space,
         env.action_space,

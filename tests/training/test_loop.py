@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
-from merl.agents.merl import MERLConfig, make_merl
+from merl.agents.merl import MERLConfig
 from merl.replay import Replay, ReplayConfig
 from merl.training.config import TrainConfig
 from merl.training.loop import Moment, Progress, Randomness, train
@@ -33,7 +34,7 @@ class Parts:
         self.env = env or DotEnv()
         self.randomness = Randomness(config.seed)
         space, actions = self.env.observation_space, self.env.action_space
-        self.agent: DDPG = make_merl(
+        self.agent: DDPG = make_agent(
             config.agent, space, actions, frame_stack=3, seed=self.randomness.agent, device=CPU
         )
         self.replay = Replay(config.replay, space, actions, capacity=config.steps)

@@ -3,88 +3,40 @@
 What is learnt from is a batch of (o_t, a_t, r_{t:t+n-1}, o_{t+n}); what an agent makes of its
 observations is the business of the networks that it declares. The methods below read beside
 Algorithm 1: `update_critic`, `update_actor`, `update_target`.
+
+Agent `ddpg` is this learner on the state, as it is (docs/agents/ddpg.md).
 """
 
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from merl.core import Batch, MerlError, check_choice
+from merl.agents.config import AgentConfig
+from merl.agents.networks import Networks
+from merl.core import Batch
 from merl.networks.augmentation import draw_shifts
-from merl.networks.fusion import Fusion
-from merl.networks.heads import Actor, TwinCritic
-from merl.networks.representation import Encoders
-
-Precision = Literal["auto", "fp32", "bf16"]
-Target = Literal["heads", "heads_and_fusion"]
 
 
 @dataclass(frozen=True)
-class DDPGConfig:
-    """How the learner learns; the values are Table 1's."""
+class DDPGConfig(AgentConfig):
+    """DDPG on the state, with clipped double Q (Fujimoto et al. 2018) and 3-step returns."""
 
-    learning_rate: float = 1e-4
-    """Adam's step size, for every network."""
-    tau: float = 0.01
-    """How far the target network moves towards the critic at each update, in (0, 1]."""
-    noise_std: float = 0.2
-    """Standard deviation of the exploration noise, also used in both updates."""
-    noise_clip: float = 0.3
-    """Bound of the noise in both updates; when acting it is not clipped."""
-    target: Target = "heads"
-    """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too, as DrQ-v2's target
-    covers its trunk."""
-    precision: Precision = "auto"
-    """Arithmetic of the update: fp32, bf16 (weights, norms, targets and losses stay fp32), or auto,
-    which times both once."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.learning_rate < math.inf:
-            raise MerlError(f"agent.learning-rate must be above 0, not {self.learning_rate}")
-        check_choice("agent.precision", self.precision, get_args(Precision))
-        check_choice("agent.target", self.target, get_args(Target))
-        if not 0 < self.tau <= 1:
-            raise MerlError(f"agent.tau must lie in (0, 1], not {self.tau}")
-        if not 0 <= self.noise_std < math.inf:
-            raise MerlError(f"agent.noise-std must be at least 0, not {self.noise_std}")
-        if not self.noise_clip >= 0:
-            raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
-
-
-class Networks(nn.Module):
-    """The parametric networks of Algorithm 1, without the targets.
-
-    Attributes:
-        encoders: f_xi and g_zeta, learnt by the critic's loss.
-        critic_fusion: h_psi of the critic.
-        critic: Q_phi1 and Q_phi2.
-        actor_fusion: h_psi of the actor.
-        actor: pi_theta.
-    """
-
-    def __init__(
-        self,
-        encoders: Encoders,
-        critic_fusion: Fusion,
-        critic: TwinCritic,
-        actor_fusion: Fusion,
-        actor: Actor,
-    ) -> None:
-        super().__init__()
-        self.encoders = encoders
-        self.critic_fusion = critic_fusion
-        self.critic = critic
-        self.actor_fusion = actor_fusion
-        self.actor = actor
+    images: tuple[str, ...] | None = ()
+    """Image keys to see: none."""
+    vectors: tuple[str, ...] | None = ("state",)
+    """Vector keys to feel."""
+    latent_dim: int = 0
+    """d, the length of a fused representation; 0 is none: the state goes to the heads as it is."""
+    head_norm: bool = False
+    """LayerNorm in the hidden layers of actor and critic."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +46,8 @@ class Draws:
     Attributes:
         shifts: crops of o_t, per image key int64 (B, 2).
         next_shifts: crops of o_{t+n}, likewise.
-        next_noise: epsilon of the target's action, clipped, (B, A).
-        actor_noise: epsilon of the actor's action, clipped, (B, A).
+        next_noise: epsilon of the target's action, (B, A): clipped here, standard normal in SAC.
+        actor_noise: epsilon of the actor's action, likewise.
     """
 
     shifts: dict[str, Tensor]
@@ -112,11 +64,15 @@ class DDPG:
         config: how to learn; `precision` "auto" counts as fp32 here.
         seed: of the noise and the shifts.
         device: where everything lives.
+
+    Attributes:
+        step: environment steps so far, which the noise may depend on; set by who drives it.
     """
 
     def __init__(
-        self, networks: Networks, config: DDPGConfig, *, seed: int, device: torch.device
+        self, networks: Networks, config: AgentConfig, *, seed: int, device: torch.device
     ) -> None:
+        self.step = 0
         self.config = config
         self.device = device
         self.networks = networks.to(device)
@@ -127,13 +83,18 @@ class DDPG:
             *networks.critic_fusion.parameters(),
             *networks.critic.parameters(),
         ]
-        self.actor_parameters = [*networks.actor_fusion.parameters(), *networks.actor.parameters()]
+        self.actor_parameters = [*self._actors_fusion(), *networks.actor.parameters()]
         self.critic_optimizer = self._adam(self.critic_parameters)
         self.actor_optimizer = self._adam(self.actor_parameters)
         words = np.random.SeedSequence(seed).generate_state(2)
         self.acting, self.learning = (
             torch.Generator(device).manual_seed(int(word)) for word in words
         )
+
+    @property
+    def senses(self) -> tuple[str, ...]:
+        """The keys of an observation that it acts on."""
+        return self.networks.senses
 
     # Acting ---------------------------------------------------------------------------------
 
@@ -148,12 +109,11 @@ class DDPG:
         Returns:
             Actions (B, A), in [-1, 1].
         """
-        networks = self.networks
-        mean: Tensor = networks.actor(networks.actor_fusion(networks.encoders(observation)))
+        mean: Tensor = self.networks.actor(self._actor_latent(observation))
         if not explore:
             return mean
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
-        return (mean + self.config.noise_std * noise).clamp(-1.0, 1.0)
+        return (mean + self.config.noise(self.step) * noise).clamp(-1.0, 1.0)
 
     # Learning -------------------------------------------------------------------------------
 
@@ -187,14 +147,13 @@ class DDPG:
         networks = self.networks
         with self._arithmetic():
             with torch.no_grad():
-                next_action = networks.actor(networks.actor_fusion(next_encoded)) + next_noise
-                next_latent = self._target_part("critic_fusion")(next_encoded)
-                q1, q2 = self._target_part("critic")(next_latent, next_action.clamp(-1.0, 1.0))
-                y = batch.reward + batch.discount * torch.minimum(q1, q2)  # (B,)
+                y = batch.reward + batch.discount * self.next_value(
+                    next_encoded, next_noise
+                )  # (B,)
             latent = networks.critic_fusion(encoded)  # (B, d)
             q1, q2 = networks.critic(latent, batch.action)
         loss = (q1 - y).square().mean() + (q2 - y).square().mean()
-        _step(self.critic_optimizer, loss, self.critic_parameters)
+        step_optimizer(self.critic_optimizer, loss, self.critic_parameters)
         return {
             "critic_loss": loss.detach(),
             "q": q1.detach().mean(),
@@ -203,20 +162,34 @@ class DDPG:
             "reward": batch.reward.mean(),
         }
 
+    def next_value(self, next_encoded: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+        """min_k Q_phi_k-bar(o_{t+n}, pi(o_{t+n}) + epsilon), (B,)."""
+        action = self.networks.actor(self.networks.actor_latent(next_encoded)) + noise
+        return self.target_q(next_encoded, action.clamp(-1.0, 1.0))
+
+    def target_q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
+        """The lesser of the averaged critic's two values, (B,)."""
+        latent = self._target_part("critic_fusion")(encoded)
+        q1, q2 = self._target_part("critic")(latent, action)
+        return torch.minimum(q1, q2)
+
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
         """Eq. 2: the actor and its fusion towards actions of higher value; nothing else moves."""
-        networks = self.networks
         with self._arithmetic():
-            with torch.no_grad():
-                critic_latent = networks.critic_fusion(encoded)
-            mean = networks.actor(networks.actor_fusion(encoded))  # (B, A)
-            q1, q2 = networks.critic(critic_latent, _clamp_straight_through(mean + noise))
-        loss = -torch.minimum(q1, q2).mean()
-        _step(self.actor_optimizer, loss, self.actor_parameters)
+            mean = self.networks.actor(self.networks.actor_latent(encoded))  # (B, A)
+            loss = -self.q(encoded, _clamp_straight_through(mean + noise)).mean()
+        step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         return {
             "actor_loss": loss.detach(),
             "action_saturation": (mean.detach().abs() > 0.95).float().mean(),
         }
+
+    def q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
+        """min_k Q_phi_k(o_t, a), (B,), as a function of the action alone."""
+        with torch.no_grad():
+            latent = self.networks.critic_fusion(encoded)
+        q1, q2 = self.networks.critic(latent, action)
+        return torch.minimum(q1, q2)
 
     @torch.no_grad()
     def update_target(self) -> None:
@@ -233,14 +206,16 @@ class DDPG:
         shifts, next_shifts = (
             {key: draw_shifts(size, pad, generator) for key in keys} for _ in range(2)
         )
-        clip = self.config.noise_clip
         noise, next_noise = (
-            torch.randn(batch.action.shape, generator=generator, device=self.device)
-            .mul_(self.config.noise_std)
-            .clamp_(-clip, clip)
+            self.epsilon(torch.randn(batch.action.shape, generator=generator, device=self.device))
             for _ in range(2)
         )
         return Draws(shifts, next_shifts, next_noise, noise)
+
+    def epsilon(self, noise: Tensor) -> Tensor:
+        """Standard normal numbers to the noise of an update: clip(N(0, sigma^2), -c, c)."""
+        clip = self.config.noise_clip
+        return noise.mul_(self.config.noise(self.step)).clamp_(-clip, clip)
 
     # Saving ---------------------------------------------------------------------------------
 
@@ -259,8 +234,8 @@ class DDPG:
         """Take back what `state_dict` gave."""
         self.networks.load_state_dict(state["networks"])
         self.critic_target.load_state_dict(state["critic_target"])
-        _load(self.critic_optimizer, state["critic_optimizer"])
-        _load(self.actor_optimizer, state["actor_optimizer"])
+        load_optimizer(self.critic_optimizer, state["critic_optimizer"])
+        load_optimizer(self.actor_optimizer, state["actor_optimizer"])
         for name in ("acting", "learning"):
             generator: torch.Generator = getattr(self, name)
             # A CPU's generator and CUDA's have states of other kinds: on another device than the
@@ -269,6 +244,19 @@ class DDPG:
                 generator.set_state(state[name].cpu())
 
     # ----------------------------------------------------------------------------------------
+
+    def _actor_latent(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """Of what the actor senses; what only the critic is told may be absent."""
+        networks = self.networks
+        sensed = {key: observation[key] for key in networks.senses}
+        return networks.actor_latent(networks.encoders(sensed))
+
+    def _actors_fusion(self) -> Iterator[nn.Parameter]:
+        """The fusion that the actor's loss moves: its own, or by name the critic's too."""
+        if self.networks.actor_fusion is not None:
+            yield from self.networks.actor_fusion.parameters()
+        elif self.config.fusion == "shared_by_both":
+            yield from self.networks.critic_fusion.parameters()
 
     def _target_part(self, name: str) -> nn.Module:
         """The averaged copy of a network, or the network itself where none is kept."""
@@ -288,18 +276,20 @@ class DDPG:
         enabled = self.config.precision == "bf16"
         return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled)
 
-    def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Adam:
+    def _adam(self, parameters: Sequence[Tensor]) -> torch.optim.Adam:
         return torch.optim.Adam(parameters, lr=self.config.learning_rate, fused=True)
 
 
-def _step(optimizer: torch.optim.Optimizer, loss: Tensor, parameters: list[nn.Parameter]) -> None:
+def step_optimizer(
+    optimizer: torch.optim.Optimizer, loss: Tensor, parameters: Sequence[Tensor]
+) -> None:
     """One step of gradient descent on these parameters; other gradients stay as they are."""
     optimizer.zero_grad()
     torch.autograd.backward(loss, inputs=parameters)
     optimizer.step()
 
 
-def _load(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
+def load_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
     """Take back Adam's moments, as copies in the memory order of the weights.
 
     The fused step walks raw memory: moments in another order would meet the wrong weights.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import merl
 from merl.bench.renderers import renderer_speeds
 from merl.cli.parsing import parse
 from merl.core import MerlError
-from merl.experiments.presets import PRESETS
+from merl.experiments.presets import compose
 from merl.resources import available_memory, free_disk
 from merl.training.run import machine, package_versions
 from merl.training.trainer import Trainer
@@ -66,7 +65,7 @@ def processor_features() -> list[str]:
 
 def _expected(preset: str) -> str:
     """What training would bring, from timing its update and its step."""
-    config = dataclasses.replace(PRESETS[preset], task=TASK)
+    config = compose(preset, TASK)
     try:
         with Trainer.prepare(config, new=False) as trainer:
             timing = trainer.timing

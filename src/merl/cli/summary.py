@@ -14,7 +14,8 @@ from merl.core import MerlError, Observation
 from merl.report.figures import learning_curve
 from merl.report.references import Reference, references
 from merl.training.config import TrainConfig
-from merl.training.evaluation import Evaluation, evaluate, make_run_env
+from merl.training.environment import make_run_env
+from merl.training.evaluation import Evaluation, evaluate
 from merl.training.trainer import Outcome
 
 FLOORS = ("random actions", "no motion")
@@ -50,8 +51,8 @@ def summarize(outcome: Outcome, console: Console) -> None:
 
 
 def random_reference(config: TrainConfig, episodes: int = 20) -> Reference:
-    """Uniformly random actions from the evaluation's starts; nothing is rendered for them."""
-    env = make_run_env(config, observations=("proprio",))
+    """Uniformly random actions from the evaluation's starts."""
+    env = make_run_env(config)
     rng = np.random.default_rng(0)
     shape = env.action_space.shape
     assert shape is not None

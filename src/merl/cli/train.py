@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import torch
 import tyro
@@ -16,11 +16,11 @@ from rich.filesize import decimal
 
 from merl.cli.parsing import parse, program
 from merl.cli.summary import summarize
-from merl.core import MerlError, meant
-from merl.experiments.presets import ABOUT, PRESETS, preset_for
+from merl.core import MerlError
+from merl.experiments.presets import PRESETS, compose
 from merl.replay import replay_bytes
 from merl.training.checkpoint import Checkpoint
-from merl.training.config import TrainConfig
+from merl.training.config import Setting, TrainConfig
 from merl.training.console import ConsoleView
 from merl.training.run import Run
 from merl.training.trainer import Trainer
@@ -29,9 +29,12 @@ from merl.training.trainer import Trainer
 def train(args: list[str]) -> int:
     """Train an agent: merl train TASK [--preset paper|laptop|state|smoke] [--steps N] ..."""
     preset, why = _choose_preset(args)
-    task = parse(TrainConfig, "merl train", args, default=PRESETS[preset]).task
-    config = parse(TrainConfig, "merl train", args, default=preset_for(preset, task))
-    return _train(config, f"preset {preset} ({why}; {ABOUT[preset]})")
+    agent = _given(args, "--agent")
+    setting = cast(Setting, _given(args, "--setting") or "matched")  # `compose` checks it
+    default = compose(preset, tyro.MISSING, agent, setting)
+    task = parse(TrainConfig, "merl train", args, default=default).task
+    config = parse(TrainConfig, "merl train", args, default=compose(preset, task, agent, setting))
+    return _train(config, f"preset {preset} ({why}; {PRESETS[preset].about})")
 
 
 def resume(args: list[str]) -> int:
@@ -144,16 +147,19 @@ def _amount(config: TrainConfig, done: int) -> str:
 
 def _choose_preset(args: list[str]) -> tuple[str, str]:
     """The preset's name and why it is this one."""
-    for index, arg in reversed(list(enumerate(args))):  # of two, the last one counts
-        name = None
-        if arg == "--preset" and index + 1 < len(args):
-            name = args[index + 1]
-        elif arg.startswith("--preset="):
-            name = arg.removeprefix("--preset=")
-        if name is not None:
-            if name not in PRESETS:
-                raise MerlError(f"preset {name!r} is unknown: {meant(name, PRESETS)}")
-            return name, "as asked for"
+    name = _given(args, "--preset")
+    if name is not None:
+        return name, "as asked for"
     if torch.cuda.is_available():
         return "paper", "CUDA is there"
     return "laptop", "no CUDA here"
+
+
+def _given(args: list[str], flag: str) -> str | None:
+    """What a flag is given, before the whole line is parsed; of two, the last one counts."""
+    for index, arg in reversed(list(enumerate(args))):
+        if arg == flag and index + 1 < len(args):
+            return args[index + 1]
+        if arg.startswith(f"{flag}="):
+            return arg.removeprefix(f"{flag}=")
+    return None

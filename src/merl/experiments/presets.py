@@ -3,80 +3,167 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, get_args
 
 import tyro
 
-from merl.agents.merl import MERLConfig
+from merl.agents import AGENTS
+from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
 from merl.replay import ReplayConfig
-from merl.training.config import EvaluationConfig, TrainConfig
+from merl.training.config import EvaluationConfig, Setting, TrainConfig
 
 _TASK: str = tyro.MISSING  # the command line asks for it
 
-PRESETS: dict[str, TrainConfig] = {
-    # Table 1 of the paper, on pictures as OpenGL draws them.
-    "paper": TrainConfig(_TASK, preset="paper"),
-    # Made for two cores without a GPU: what learns most per minute (docs/laptop.md).
-    "laptop": TrainConfig(
-        _TASK,
-        preset="laptop",
-        steps=200_000,
-        # An hour of updates is short and random steps are cheap: begin with some that met a reward.
-        random_steps=10_000,
-        seed_steps=10_000,
-        env=EnvConfig(renderer="warp", image_size=48),
-        replay=ReplayConfig(batch_size=128),
-        agent=MERLConfig(
-            learning_rate=3e-4, conv_strides=(3, 2, 1, 1), shift_pad=2, hidden_dim=256
+
+@dataclass(frozen=True)
+class Preset:
+    """What a preset sets.
+
+    Attributes:
+        about: what it is for.
+        config: everything but the agent.
+        agent: what it changes of an agent's values, whichever agent it is.
+        agent_name: who learns, if nobody is named.
+    """
+
+    about: str
+    config: TrainConfig
+    agent: Mapping[str, Any] = field(default_factory=dict)
+    agent_name: str = "merl"
+
+
+PRESETS: dict[str, Preset] = {
+    "paper": Preset(
+        "Table 1, OpenGL pictures: for a machine with CUDA",
+        TrainConfig(_TASK),
+    ),
+    "laptop": Preset(
+        "made for 2 cores without a GPU: learns in about an hour",  # docs/laptop.md
+        TrainConfig(
+            _TASK,
+            steps=200_000,
+            # An hour of updates is short and random steps are cheap: begin with some that met a
+            # reward.
+            random_steps=10_000,
+            seed_steps=10_000,
+            env=EnvConfig(renderer="warp", image_size=48),
+            replay=ReplayConfig(batch_size=128),
+            eval=EvaluationConfig(every=10_000, episodes=10, video="last"),
         ),
-        eval=EvaluationConfig(every=10_000, episodes=10, video="last"),
+        {
+            "learning_rate": 3e-4,
+            "conv_strides": (3, 2, 1, 1),
+            "shift_pad": 2,
+            "hidden_dim": 256,
+        },
     ),
-    # No camera: the simulator's state, small networks, one core (docs/tasks.md).
-    "state": TrainConfig(
-        _TASK,
-        preset="state",
-        steps=500_000,
-        threads=1,
-        env=EnvConfig(renderer="warp", observations=("state",)),
-        agent=MERLConfig(vectors=("state",), hidden_dim=256, precision="fp32"),
-        eval=EvaluationConfig(every=20_000, episodes=20, video="last"),
+    "state": Preset(
+        "learns from the simulator's state in place of camera and joints, on one core",
+        TrainConfig(
+            _TASK,
+            steps=500_000,
+            threads=1,
+            env=EnvConfig(renderer="warp"),
+            eval=EvaluationConfig(every=20_000, episodes=20, video="last"),
+        ),
+        {"hidden_dim": 256, "precision": "fp32"},
+        "merl_state",
     ),
-    # The whole pipeline in under a minute; too short to learn anything.
-    "smoke": TrainConfig(
-        _TASK,
-        preset="smoke",
-        steps=1000,
-        random_steps=250,
-        seed_steps=250,
-        updates_per_step=0.1,
-        env=EnvConfig(renderer="warp", image_size=32),
-        replay=ReplayConfig(batch_size=32),
-        agent=MERLConfig(conv_strides=(2, 2, 1, 1), shift_pad=2, hidden_dim=128),
-        eval=EvaluationConfig(every=500, episodes=2, video="last"),
+    "smoke": Preset(
+        "the whole pipeline in under a minute: shows that it works, learns nothing",
+        TrainConfig(
+            _TASK,
+            steps=1000,
+            random_steps=250,
+            seed_steps=250,
+            updates_per_step=0.1,
+            env=EnvConfig(renderer="warp", image_size=32),
+            replay=ReplayConfig(batch_size=32),
+            eval=EvaluationConfig(every=500, episodes=2, video="last"),
+        ),
+        {"conv_strides": (2, 2, 1, 1), "shift_pad": 2, "hidden_dim": 128},
     ),
 }
 
 HEAD_LAYERS = {"move_box": 6, "lift_box": 6}
-"""Layers of the heads in preset `paper`, where the task wants others than three (MERL C.1)."""
+"""Layers of MERL's heads in preset `paper`, where the task wants others than three (MERL C.1)."""
 
 
-def preset_for(name: str, task: str) -> TrainConfig:
-    """A preset as it is for a task.
+@dataclass(frozen=True)
+class Published:
+    """What an agent's authors ran it with.
+
+    Attributes:
+        run: fields of `TrainConfig`.
+        replay: fields of `ReplayConfig`.
+        agent: fields of the agent's config.
+    """
+
+    run: Mapping[str, Any]
+    replay: Mapping[str, Any] = field(default_factory=dict)
+    agent: Mapping[str, Any] = field(default_factory=dict)
+
+
+PUBLISHED: dict[str, Published] = {
+    # Its own repository, for its tasks of medium difficulty: an action is held for two steps, an
+    # update every second decision, 2000 random decisions.
+    "drqv2": Published(
+        {"action_repeat": 2, "updates_per_step": 0.25, "random_steps": 4000, "seed_steps": 4000},
+        {"batch_size": 256},
+    ),
+    # TD3's own repository, of whose critic this is; TD3's paper has layers of 400 and 300.
+    "ddpg": Published(
+        {"updates_per_step": 1.0, "random_steps": 25_000, "seed_steps": 25_000},
+        {"batch_size": 256},
+        {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256, "noise_std": 0.1},
+    ),
+    # Haarnoja et al. 2018b, Table 1, and its own repository for the random start.
+    "sac": Published(
+        {"updates_per_step": 1.0, "random_steps": 10_000, "seed_steps": 10_000},
+        {"batch_size": 256, "n_step": 1},
+        {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
+    ),
+}
+"""What `--setting published` takes in place of the preset's values (docs/agents/)."""
+
+
+def compose(
+    preset: str, task: str, agent: str | None = None, setting: Setting = "matched"
+) -> TrainConfig:
+    """The values of a run before any of them is overridden.
 
     Args:
-        name: a key of `PRESETS`.
-        task: what is to be learnt; only preset `paper` asks.
+        preset: a key of `PRESETS`.
+        task: what is to be learnt.
+        agent: a key of `AGENTS`; the preset's own, if not given.
+        setting: `matched`: the preset's values for the agent, which are MERL's; `published`: its
+            authors'.
+
+    Raises:
+        MerlError: the agent has no published setting, or a name is unknown.
     """
-    preset = PRESETS[name]
-    if name != "paper" or task not in HEAD_LAYERS:
-        return preset
-    agent = dataclasses.replace(preset.agent, head_layers=HEAD_LAYERS[task])
-    return dataclasses.replace(preset, agent=agent)
-
-
-ABOUT = {
-    "paper": "Table 1, OpenGL pictures: for a machine with CUDA",
-    "laptop": "made for 2 cores without a GPU: learns in about an hour",
-    "state": "learns from the simulator's state in place of camera and joints, on one core",
-    "smoke": "the whole pipeline in under a minute: shows that it works, learns nothing",
-}
+    check_choice("preset", preset, tuple(PRESETS))
+    chosen = PRESETS[preset]
+    name = agent or chosen.agent_name
+    check_choice("agent", name, tuple(AGENTS))
+    check_choice("setting", setting, get_args(Setting))
+    config = dataclasses.replace(
+        chosen.config, task=task, preset=preset, agent_name=name, setting=setting
+    )
+    values = dict(chosen.agent)
+    if preset == "paper":
+        values["head_layers"] = HEAD_LAYERS.get(task, 3)
+    if setting == "published":
+        if name not in PUBLISHED:
+            raise MerlError(
+                f"agent {name!r} has no setting published: {', '.join(PUBLISHED)} have one; preset "
+                "paper has the paper's values"
+            )
+        theirs = PUBLISHED[name]
+        replay = dataclasses.replace(config.replay, **theirs.replay)
+        config = dataclasses.replace(config, replay=replay, **theirs.run)
+        values = dict(theirs.agent)
+    return dataclasses.replace(config, agent=dataclasses.replace(AGENTS[name], **values))

@@ -23,6 +23,10 @@ class Fusion(nn.Module):
         latent_dim: d, the length of the whole; split evenly over the modalities.
         layer_norm: whether to normalise (the paper's Figure 3c switches it off).
         squash: "tanh", or "simplex" for a softmax over groups of eight.
+
+    Attributes:
+        latent_dim: d.
+        modalities: the keys.
     """
 
     def __init__(
@@ -45,6 +49,7 @@ class Fusion(nn.Module):
                 f"not {share}: use agent.latent-dim {SIMPLEX_GROUP * len(features)} or a multiple"
             )
         self.squash = squash
+        self.latent_dim = latent_dim
         self.modalities = tuple(features)
         self.projections = nn.ModuleDict(
             {module_name(key): nn.Linear(n, share) for key, n in features.items()}
@@ -70,3 +75,24 @@ class Fusion(nn.Module):
             return torch.tanh(latent)
         groups = latent.reshape(len(latent), -1, SIMPLEX_GROUP)
         return torch.softmax(groups, dim=-1).flatten(-2)
+
+
+class Concatenation(nn.Module):
+    """No fusion: the encodings side by side, as state-based agents take them.
+
+    Args:
+        features: the length of each modality's encoding, by key, in the order of concatenation.
+
+    Attributes:
+        latent_dim: the sum of the lengths.
+        modalities: the keys.
+    """
+
+    def __init__(self, features: Mapping[str, int]) -> None:
+        super().__init__()
+        self.latent_dim = sum(features.values())
+        self.modalities = tuple(features)
+
+    def forward(self, encoded: Mapping[str, Tensor]) -> Tensor:
+        """Encodings {key: (B, F_key)} to (B, sum of F_key)."""
+        return torch.cat([encoded[key] for key in self.modalities], dim=-1)

@@ -63,6 +63,26 @@ class Actor(nn.Module):
         return torch.tanh(self.layers(latent))
 
 
+class GaussianActor(nn.Module):
+    """pi_theta of SAC: the latent to the mean and the spread of a Gaussian, before its tanh.
+
+    log sigma is brought into [-10, 2] by a tanh of its own, so that its gradient never ends at a
+    bound.
+    """
+
+    LEAST, GREATEST = -10.0, 2.0
+
+    def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
+        super().__init__()
+        self.layers = mlp(latent_dim, 2 * action_dim, size)
+
+    def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, d) to mu and log sigma, (B, A) each."""
+        mean, raw = self.layers(latent).chunk(2, dim=-1)
+        log_std = self.LEAST + (self.GREATEST - self.LEAST) * (torch.tanh(raw) + 1) / 2
+        return mean, log_std
+
+
 class TwinCritic(nn.Module):
     """Q_phi1 and Q_phi2, two heads of their own over one latent (clipped double Q, TD3)."""
 

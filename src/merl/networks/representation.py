@@ -48,7 +48,8 @@ class Encoders(nn.Module):
         """Encode each modality.
 
         Args:
-            observation: images uint8 (B, K, H, W, C), vectors float (B, n).
+            observation: images uint8 (B, K, H, W, C), vectors float (B, n); a key that is not there
+                is not encoded.
             shifts: per image key the crop of each sample, int64 (B, 2); None leaves images alone.
 
         Returns:
@@ -57,9 +58,12 @@ class Encoders(nn.Module):
         dtype = next(self.parameters(), observation[next(iter(observation))]).dtype
         encoded: dict[str, Tensor] = {}
         for key, encoder in zip(self.image_keys, self.images.values(), strict=True):
+            if key not in observation:
+                continue
             stack = observation[key]
             moved = shift(stack, shifts[key], self.pad) if shifts else stack
             encoded[key] = encoder(to_input(moved, dtype))
         for key, encoder in zip(self.vector_keys, self.vectors.values(), strict=True):
-            encoded[key] = encoder(observation[key])
+            if key in observation:
+                encoded[key] = encoder(observation[key])
         return encoded

@@ -9,10 +9,13 @@ from typing import Annotated, Literal
 
 import tyro
 
-from merl.agents.merl import MERLConfig
-from merl.core import MerlError
+from merl.agents import AGENTS
+from merl.agents.config import AgentConfig
+from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
 from merl.replay import ReplayConfig
+
+Setting = Literal["matched", "published"]
 
 MOST_STEPS = 10**12
 """Far beyond what anyone will wait for."""
@@ -47,6 +50,12 @@ class TrainConfig:
     """What is to be learnt, e.g. reach_duplo."""
     preset: str = "paper"
     """paper, laptop, state or smoke: which set of values the others are taken from."""
+    agent_name: Annotated[str, tyro.conf.arg(name="agent", metavar="|".join(AGENTS))] = "merl"
+    """Who learns. merl: camera and joints; drqv2: camera; proprio: joints; merl_state, ddpg, sac:
+    the state."""
+    setting: Setting = "matched"
+    """Whose numbers the agent has: MERL's and the preset's (matched), or its authors'
+    (published)."""
     seed: int = 0
     """The seed of everything random in the run."""
     steps: int = 1_000_000
@@ -54,8 +63,8 @@ class TrainConfig:
     minutes: float | None = None
     """Stop after this many minutes (since start or resume), if the steps are not done before."""
     run_dir: Path | None = None
-    """The run's folder, which must not exist yet; runs/TASK-PRESET-sSEED (or -2, -3, ...) if not
-    set."""
+    """The run's folder, which must not exist yet; runs/TASK-AGENT-PRESET-sSEED (or -2, -3, ...) if
+    not set."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the networks live; auto takes CUDA where it is there."""
     threads: int | None = None
@@ -66,20 +75,23 @@ class TrainConfig:
     """Steps before the first update ("seed frames" in Table 1)."""
     updates_per_step: float = 1.0
     """Updates for each environment step; below 1, an update every few steps."""
+    action_repeat: int = 1
+    """Environment steps for which an action is held; all steps here are environment steps."""
     save_every: float = 300.0
     """Seconds between checkpoints; each waits for the end of an episode."""
     keep: int = 2
     """How many of the last checkpoints are kept, beside the best."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    agent: MERLConfig = field(default_factory=MERLConfig)
+    agent: AgentConfig = field(default_factory=lambda: AGENTS["merl"])
     eval: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
-        for name in ("steps", "keep"):
+        check_choice("agent", self.agent_name, tuple(AGENTS))
+        for name in ("steps", "keep", "action_repeat"):
             if not 1 <= getattr(self, name) <= MOST_STEPS:
                 raise MerlError(
-                    f"{name} must be at least 1 and at most {MOST_STEPS:,}, "
+                    f"{name.replace('_', '-')} must be at least 1 and at most {MOST_STEPS:,}, "
                     f"not {getattr(self, name)}"
                 )
         for name in ("random_steps", "seed_steps", "seed"):
@@ -94,14 +106,14 @@ class TrainConfig:
             if not 0 <= getattr(self, name) < math.inf:
                 flag = name.replace("_", "-")
                 raise MerlError(f"{flag} must be at least 0, not {getattr(self, name)}")
-        if self.replay.batch_size > self.steps:
+        if self.replay.batch_size > self.capacity:
             raise MerlError(
-                f"replay.batch-size {self.replay.batch_size} is more than the {self.steps} steps "
-                "of the run, which is all that the replay will hold: use a smaller batch or more "
+                f"replay.batch-size {self.replay.batch_size} is more than the {self.capacity} "
+                "steps of the run, which is all that the replay will hold: use a smaller batch or more "
                 "steps"
             )
 
     @property
     def capacity(self) -> int:
-        """Steps that the replay holds: no more than the run takes."""
-        return min(self.replay.capacity, self.steps)
+        """Steps that the replay holds: no more than the run takes, a held action counted once."""
+        return min(self.replay.capacity, math.ceil(self.steps / self.action_repeat))

@@ -15,12 +15,12 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from merl.agents.merl import make_merl
+from merl.agents import make_agent
 from merl.core import Agent, MerlError, Observation, is_image
-from merl.envs import make_env
 from merl.statistics import Interval, bootstrap_interval, wilson_interval
 from merl.training.checkpoint import Checkpoint, load_networks
 from merl.training.config import TrainConfig
+from merl.training.environment import make_run_env
 from merl.training.rollout import Episode, FrameStack
 from merl.training.run import Run
 from merl.training.video import VideoWriter
@@ -51,8 +51,8 @@ class Policy:
     ) -> None:
         self.config, self.step = config, step
         self._agent = agent
-        self._space = space
-        images = tuple(key for key in space if is_image(space[key]))
+        self._space = {key: space[key] for key in agent.senses}
+        images = tuple(key for key in agent.senses if is_image(space[key]))
         self._stack = FrameStack(config.replay.frame_stack, images, device)
         self._fresh = True
 
@@ -229,13 +229,6 @@ def _caption(episode: Episode) -> dict[str, str | float | bool | int]:
     return caption
 
 
-def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
-    """The environment of a run, with fields of its `EnvConfig` (or `render_mode`) changed."""
-    render_mode = changes.pop("render_mode", None)
-    settings = {name: getattr(config.env, name) for name in type(config.env).__dataclass_fields__}
-    return make_env(config.task, render_mode=render_mode, **settings | changes)
-
-
 def load_policy(run: str | Path, *, checkpoint: str = "latest") -> Policy:
     """The policy that a run has learnt.
 
@@ -252,7 +245,7 @@ def load_policy(run: str | Path, *, checkpoint: str = "latest") -> Policy:
     if config.device == "cuda" and torch.cuda.is_available():
         device = torch.device("cuda")
     observation_space, action_space = opened.spaces()
-    agent = make_merl(
+    agent = make_agent(
         config.agent,
         observation_space,
         action_space,

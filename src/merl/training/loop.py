@@ -107,6 +107,7 @@ def train(
         stack.reset(observation)
         episode, over = Episode(), False
         while not over and progress.step < config.steps:
+            agent.step = progress.step
             if progress.step < config.random_steps:
                 action = randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
             else:
@@ -117,7 +118,7 @@ def train(
             replay.add(Transition(action, float(reward), discount, observation, over))
             stack.push(observation)
             episode.add(float(reward), info)
-            progress.step += 1
+            progress.step += config.action_repeat
             learning = _learn(agent, replay, progress, randomness, config)
             progress.episodes += over
             yield Moment(progress.step, progress.updates, learning, episode if over else None)

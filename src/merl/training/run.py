@@ -33,7 +33,8 @@ import torch
 from gymnasium import spaces
 
 import merl
-from merl.core import CONFIG_FILE, MerlError
+from merl.agents import AGENTS
+from merl.core import CONFIG_FILE, MerlError, check_choice
 from merl.training.config import TrainConfig
 
 LOCK_FILE = "lock"
@@ -64,7 +65,9 @@ class Run:
             "format": FORMAT,
             "merl": merl.__version__,
             "task": config.task,
+            "agent": config.agent_name,
             "preset": config.preset,
+            "setting": config.setting,
             "seed": config.seed,
             "config": to_plain(config),
             "observation_space": {key: _describe(s) for key, s in observation_space.items()},
@@ -97,7 +100,7 @@ class Run:
             number = record["format"]
             if number != FORMAT:
                 raise MerlError(f"it has format {number}, this merl reads {FORMAT}")
-            config = from_plain(TrainConfig, record["config"])
+            config = _read_config(record["config"])
             _recorded_spaces(record)
             _last_machine(record)
         return cls(path, dataclasses.replace(config, run_dir=path))
@@ -178,7 +181,8 @@ def run_path(config: TrainConfig) -> Path:
     """The folder that a config names, or the first of the default ones that is free."""
     if config.run_dir is not None:
         return config.run_dir
-    name = f"{config.task}-{config.preset}-s{config.seed}"
+    agent = config.agent_name if config.setting == "matched" else f"{config.agent_name}-published"
+    name = f"{config.task}-{agent}-{config.preset}-s{config.seed}"
     numbered = (Path("runs") / f"{name}-{number}" for number in itertools.count(2))
     return next(p for p in itertools.chain([Path("runs") / name], numbered) if not _exists(p))
 
@@ -209,13 +213,25 @@ def to_plain(config: Any) -> dict[str, Any]:
     return plain
 
 
-def from_plain(cls: type[T], plain: Mapping[str, Any]) -> T:
+def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
+    """A run's config; that of its agent is of the kind that the agent's name says."""
+    name = plain.get("agent_name", "merl")
+    check_choice("agent", name, tuple(AGENTS))
+    return from_plain(TrainConfig, plain, agent=type(AGENTS[name]))
+
+
+def from_plain(cls: type[T], plain: Mapping[str, Any], **narrower: type) -> T:
     """The config that `to_plain` took apart; fields that are not there keep their defaults.
+
+    Args:
+        cls: the dataclass.
+        plain: its values.
+        **narrower: the type of a field that is annotated with a base of it.
 
     Raises:
         TypeError: a value is not of its field's type.
     """
-    hints = typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls) | narrower
     known = {
         name: _restore(name, hints[name], value) for name, value in plain.items() if name in hints
     }

@@ -14,8 +14,8 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
+from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
-from merl.agents.merl import make_merl
 from merl.core import Batch, is_image
 from merl.training.config import TrainConfig
 
@@ -139,7 +139,7 @@ def _agent(
     device: torch.device,
     precision: Literal["fp32", "bf16"],
 ) -> DDPG:
-    return make_merl(
+    return make_agent(
         dataclasses.replace(config.agent, precision=precision),
         space,
         spaces.Box(-1.0, 1.0, batch.action.shape[1:]),

@@ -16,15 +16,17 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
+from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
-from merl.agents.merl import make_merl, make_networks, modalities
+from merl.agents.networks import make_networks
 from merl.core import MerlError, is_image
 from merl.replay import Replay, check_fits
 from merl.resources import available_memory
 from merl.training import checkpoint
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
-from merl.training.evaluation import Evaluation, Policy, evaluate, make_run_env
+from merl.training.environment import make_run_env, run_spaces
+from merl.training.evaluation import Evaluation, Policy, evaluate
 from merl.training.loop import Moment, Progress, Randomness, train
 from merl.training.meters import Averages, Clock
 from merl.training.metrics import MetricsWriter
@@ -108,7 +110,7 @@ class Trainer:
             agent=dataclasses.replace(config.agent, precision=best.precision),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
-        self.agent: DDPG = make_merl(
+        self.agent: DDPG = make_agent(
             self.config.agent,
             self.space,
             self.action_space,
@@ -140,13 +142,8 @@ class Trainer:
             refuse_existing(run_path(config))
         with ExitStack() as stack:
             env = make_run_env(config)
-            stack.callback(lambda: env.close())
+            stack.callback(env.close)
             space, actions = run_spaces(config, env)
-            if space != env.observation_space:  # what nobody consumes is never rendered
-                senses = dataclasses.replace(config.env, observations=tuple(space))
-                config = dataclasses.replace(config, env=senses)
-                env.close()
-                env = make_run_env(config)
             if new:
                 check_fits(
                     config.replay,
@@ -376,12 +373,3 @@ def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.B
                 f"{what} would take {need / 1e9:.3g} GB or more, but {room / 1e9:.3g} GB of memory "
                 "are available: make it smaller"
             )
-
-
-def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Box]:
-    """What the agent consumes of the observation, and the actions."""
-    assert isinstance(env.observation_space, spaces.Dict)
-    assert isinstance(env.action_space, spaces.Box)
-    images, vectors = modalities(config.agent, env.observation_space)
-    consumed = {key: env.observation_space[key] for key in (*images, *vectors)}
-    return spaces.Dict(consumed), env.action_space

@@ -1,0 +1,120 @@
+"""What an agent is made of and how it learns, as values: every agent is a choice of these."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from merl.core import MerlError, check_choice
+from merl.networks.fusion import Squash
+
+Precision = Literal["auto", "fp32", "bf16"]
+Target = Literal["heads", "heads_and_fusion"]
+FusionOwner = Literal["decoupled", "shared", "shared_by_both"]
+
+WIDEST = 65_536
+"""More than any layer here has ever been given."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """What an agent is made of and how it learns; the values are Table 1's and Appendix C.1's."""
+
+    images: tuple[str, ...] | None = None
+    """Image keys to see; every one that the environment gives, if not set."""
+    vectors: tuple[str, ...] | None = None
+    """Vector keys to feel; every one that the environment gives but `state`, if not set."""
+    critic_vectors: tuple[str, ...] = ()
+    """Vector keys that the critic alone is told, e.g. `state`: what is known in training only."""
+    learning_rate: float = 1e-4
+    """Adam's step size, for every network."""
+    tau: float = 0.01
+    """How far the target network moves towards the critic at each update, in (0, 1]."""
+    noise_std: float = 0.2
+    """Standard deviation of the exploration noise, also used in both updates."""
+    noise_std_end: float | None = None
+    """What it falls to, in a straight line over `noise_steps`; it stays as it is, if not set."""
+    noise_steps: int = 500_000
+    """Environment steps over which it falls."""
+    noise_clip: float = 0.3
+    """Bound of the noise in both updates; when acting it is not clipped."""
+    target: Target = "heads"
+    """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too, as DrQ-v2's target
+    covers its trunk."""
+    latent_dim: int = 128
+    """d, the length of the fused representation, split evenly over the modalities; 0 leaves the
+    fusion out: the encodings go to the heads as they are."""
+    fusion: FusionOwner = "decoupled"
+    """Whose the fusion is (Figure 3a): one each for critic and actor, or one that both use, which
+    the critic's loss moves, or both losses."""
+    fusion_norm: bool = True
+    """LayerNorm in the fusion (Figure 3c)."""
+    squash: Squash = "tanh"
+    """What bounds the fused representation: tanh, or a softmax over groups of eight."""
+    shift_pad: int = 4
+    """Random shift: how many pixels to each side."""
+    conv_channels: int = 32
+    """Channels of each of the image encoder's convolutions."""
+    conv_strides: tuple[int, ...] = (2, 1, 1, 1)
+    """Strides of the image encoder's convolutions."""
+    vector_encoder_dim: int = 0
+    """Width of the MLP that encodes each vector; 0 is the identity (Figure 5)."""
+    standardize: bool = False
+    """Bring the numbers of a vector to one scale, by the mean and the deviation of the first
+    batches; the paper takes them as they are."""
+    head_layers: int = 3
+    """Linear layers of actor and critic, the output layer counted (paper: 3 for reach, else 6)."""
+    hidden_dim: int = 1024
+    """Width of the hidden layers of actor and critic."""
+    head_norm: bool = True
+    """LayerNorm in the hidden layers of actor and critic."""
+    precision: Precision = "auto"
+    """Arithmetic of the update: fp32, bf16 (weights, norms, targets and losses stay fp32), or auto,
+    which times both once."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.learning_rate < math.inf:
+            raise MerlError(f"agent.learning-rate must be above 0, not {self.learning_rate}")
+        for name, value, choices in (
+            ("precision", self.precision, get_args(Precision)),
+            ("target", self.target, get_args(Target)),
+            ("squash", self.squash, get_args(Squash)),
+            ("fusion", self.fusion, get_args(FusionOwner)),
+        ):
+            check_choice(f"agent.{name}", value, choices)
+        if not 0 < self.tau <= 1:
+            raise MerlError(f"agent.tau must lie in (0, 1], not {self.tau}")
+        ends = () if self.noise_std_end is None else ("noise_std_end",)
+        for name in ("noise_std", *ends):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise MerlError(
+                    f"agent.{_flag(name)} must be at least 0, not {getattr(self, name)}"
+                )
+        if not self.noise_clip >= 0:
+            raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
+        least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1, "noise_steps": 1}
+        least |= {"latent_dim": 0, "shift_pad": 0, "vector_encoder_dim": 0}
+        for name, bound in least.items():
+            most = WIDEST if name != "noise_steps" else 10**12
+            if not bound <= getattr(self, name) <= most:
+                raise MerlError(
+                    f"agent.{_flag(name)} must be at least {bound} and at most {most}, "
+                    f"not {getattr(self, name)}"
+                )
+        if not self.conv_strides or min(self.conv_strides) < 1:
+            raise MerlError(
+                f"agent.conv-strides {self.conv_strides} must name a stride of at least 1 for each "
+                "convolution"
+            )
+
+    def noise(self, step: int) -> float:
+        """The standard deviation of the exploration noise after `step` environment steps."""
+        if self.noise_std_end is None:
+            return self.noise_std
+        share = min(step / self.noise_steps, 1.0)
+        return self.noise_std + share * (self.noise_std_end - self.noise_std)
+
+
+def _flag(name: str) -> str:
+    return name.replace("_", "-")

@@ -1,0 +1,181 @@
+"""An agent's networks: what its config declares, built for the senses that an environment gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gymnasium import spaces
+from torch import Tensor, nn
+
+from merl.agents.config import AgentConfig
+from merl.core import MerlError, is_image, is_vector
+from merl.networks.encoders import ConvEncoder, VectorEncoder
+from merl.networks.fusion import Concatenation, Fusion
+from merl.networks.heads import Actor, GaussianActor, HeadSize, TwinCritic
+from merl.networks.initialization import orthogonal
+from merl.networks.representation import Encoders
+
+
+class Networks(nn.Module):
+    """The parametric networks of Algorithm 1, without the targets.
+
+    Attributes:
+        encoders: f_xi and g_zeta, learnt by the critic's loss.
+        critic_fusion: h_psi of the critic.
+        critic: Q_phi1 and Q_phi2.
+        actor_fusion: h_psi of the actor; None where it uses the critic's.
+        actor: pi_theta.
+    """
+
+    def __init__(
+        self,
+        encoders: Encoders,
+        critic_fusion: Fusion | Concatenation,
+        critic: TwinCritic,
+        actor_fusion: Fusion | Concatenation | None,
+        actor: Actor | GaussianActor,
+    ) -> None:
+        super().__init__()
+        self.encoders = encoders
+        self.critic_fusion = critic_fusion
+        self.critic = critic
+        self.actor_fusion = actor_fusion
+        self.actor = actor
+
+    @property
+    def senses(self) -> tuple[str, ...]:
+        """The keys that the actor acts on."""
+        return self._actors().modalities
+
+    def actor_latent(self, encoded: Mapping[str, Tensor]) -> Tensor:
+        """What the actor sees: the encodings, fused."""
+        latent: Tensor = self._actors()(encoded)
+        return latent
+
+    def _actors(self) -> Fusion | Concatenation:
+        return self.critic_fusion if self.actor_fusion is None else self.actor_fusion
+
+
+def make_networks(
+    config: AgentConfig,
+    space: spaces.Dict,
+    action_dim: int,
+    stack: int,
+    actor: type[Actor] | type[GaussianActor] = Actor,
+) -> Networks:
+    """Build and initialise an agent's networks (from torch's global seed).
+
+    Args:
+        config: what they are made of.
+        space: what the environment gives.
+        action_dim: A.
+        stack: frames of an image that are seen at once.
+        actor: the kind of policy.
+
+    Raises:
+        MerlError: the space lacks what the agent consumes, or the config does not fit it.
+    """
+    images, vectors = modalities(config, space)
+    encoders = Encoders(
+        {key: _image_encoder(config, space[key], stack) for key in images},
+        {
+            key: _vector_encoder(config, space[key])
+            for key in (*vectors, *told_to_critic(config, space))
+        },
+        pad=config.shift_pad,
+    )
+    senses = {key: encoders.features[key] for key in (*images, *vectors)}
+    critic_fusion = _fusion(config, encoders.features, len(senses))
+    actor_fusion = None
+    if config.fusion == "decoupled":
+        actor_fusion = _fusion(config, senses, len(senses))
+    size = HeadSize(config.head_layers, config.hidden_dim, config.head_norm)
+    critic = TwinCritic(critic_fusion.latent_dim, action_dim, size)
+    policy = actor((actor_fusion or critic_fusion).latent_dim, action_dim, size)
+    networks = Networks(encoders, critic_fusion, critic, actor_fusion, policy)
+    orthogonal(networks)
+    return networks
+
+
+def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The image keys and the vector keys that the agent acts on, checked against the space.
+
+    Raises:
+        MerlError: naming the key that is missing, and how to get it.
+    """
+    images = _keys("images", config.images, [k for k, s in space.items() if is_image(s)])
+    given = [k for k, s in space.items() if is_vector(s)]
+    vectors = _keys("vectors", config.vectors, given, default=[k for k in given if k != "state"])
+    if not images and not vectors:
+        hint = (
+            "name it with --agent.vectors state, or take --agent merl_state, ddpg or sac"
+            if "state" in given
+            else "an image is a uint8 box (H, W, C), a vector a float box (n,)"
+        )
+        raise MerlError(f"the agent finds nothing to sense among {sorted(space)}: {hint}")
+    return images, vectors
+
+
+def told_to_critic(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
+    """The vector keys that the critic has beyond the actor's.
+
+    Raises:
+        MerlError: a key is missing, is the actor's too, or the fusion is shared.
+    """
+    given = [k for k, s in space.items() if is_vector(s)]
+    keys = _keys("critic-vectors", config.critic_vectors, given)
+    _, vectors = modalities(config, space)
+    for key in keys:
+        if key in vectors:
+            raise MerlError(f"agent.critic-vectors names {key!r}, which the actor has already")
+    if keys and config.fusion != "decoupled":
+        raise MerlError(
+            f"agent.critic-vectors {keys} needs a fusion of the critic's own: use --agent.fusion "
+            f"decoupled in place of {config.fusion}"
+        )
+    return keys
+
+
+def _fusion(
+    config: AgentConfig, features: Mapping[str, int], senses: int
+) -> Fusion | Concatenation:
+    """For these modalities; each has the share of d that it has in the actor's fusion."""
+    if config.latent_dim == 0:
+        return Concatenation(features)
+    if config.latent_dim % senses:
+        raise MerlError(
+            f"agent.latent-dim {config.latent_dim} does not split evenly over {senses} modalities "
+            f"({', '.join(features)}): use a multiple of {senses}"
+        )
+    latent_dim = config.latent_dim // senses * len(features)
+    return Fusion(features, latent_dim, config.fusion_norm, config.squash)
+
+
+def _image_encoder(config: AgentConfig, space: spaces.Space[Any], stack: int) -> ConvEncoder:
+    assert space.shape is not None
+    height, width, channels = space.shape
+    if config.shift_pad >= min(height, width):
+        raise MerlError(
+            f"agent.shift-pad {config.shift_pad} moves a picture of {height}x{width} pixels out of "
+            f"sight: give at most {min(height, width) - 1}"
+        )
+    return ConvEncoder(stack * channels, (height, width), config.conv_channels, config.conv_strides)
+
+
+def _vector_encoder(config: AgentConfig, space: spaces.Space[Any]) -> VectorEncoder:
+    assert space.shape is not None
+    return VectorEncoder(space.shape[0], config.vector_encoder_dim, config.standardize)
+
+
+def _keys(
+    kind: str, chosen: tuple[str, ...] | None, given: list[str], default: list[str] | None = None
+) -> tuple[str, ...]:
+    if chosen is None:
+        return tuple(given if default is None else default)
+    for key in chosen:
+        if key not in given:
+            raise MerlError(
+                f"agent.{kind} names {key!r}, but the environment gives {given or 'none such'}"
+            )
+    return chosen

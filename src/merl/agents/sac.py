@@ -1,0 +1,138 @@
+"""Soft actor-critic with a learnt temperature (Haarnoja et al. 2018b), on the learner's parts.
+
+What differs from the learner: the policy is a Gaussian through a tanh, whose entropy is paid for in
+the critic's target and in the actor's loss at the price alpha, and alpha is moved so that the
+entropy comes to a target. With n-step returns the entropy is paid at the last of the n steps alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+import tyro
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from merl.agents.config import AgentConfig
+from merl.agents.ddpg import DDPG, load_optimizer, step_optimizer
+from merl.agents.networks import Networks
+from merl.core import MerlError
+
+
+@dataclass(frozen=True)
+class SACConfig(AgentConfig):
+    """SAC on the state, with a learnt temperature (Haarnoja et al. 2018b)."""
+
+    images: tuple[str, ...] | None = ()
+    """Image keys to see: none."""
+    vectors: tuple[str, ...] | None = ("state",)
+    """Vector keys to feel."""
+    latent_dim: int = 0
+    """d, the length of a fused representation; 0 is none: the state goes to the heads as it is."""
+    head_norm: bool = False
+    """LayerNorm in the hidden layers of actor and critic."""
+    temperature: float = 1.0
+    """alpha at the start."""
+    target_entropy: float | None = None
+    """What the policy's entropy is to be, in nats; minus the number of actions, if not set."""
+    # The noise is the policy's own.
+    noise_std: Annotated[float, tyro.conf.Suppress] = 0.0
+    noise_std_end: Annotated[float | None, tyro.conf.Suppress] = None
+    noise_steps: Annotated[int, tyro.conf.Suppress] = 1
+    noise_clip: Annotated[float, tyro.conf.Suppress] = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.temperature < math.inf:
+            raise MerlError(f"agent.temperature must be above 0, not {self.temperature}")
+        if self.target_entropy is not None and not math.isfinite(self.target_entropy):
+            raise MerlError(f"agent.target-entropy must be finite, not {self.target_entropy}")
+
+
+class SAC(DDPG):
+    """The soft actor-critic.
+
+    Args:
+        networks: with a `GaussianActor`.
+        config: how to learn.
+        seed: of the noise and the shifts.
+        device: where everything lives.
+    """
+
+    config: SACConfig
+
+    def __init__(
+        self, networks: Networks, config: SACConfig, *, seed: int, device: torch.device
+    ) -> None:
+        super().__init__(networks, config, seed=seed, device=device)
+        start = math.log(config.temperature)
+        self.log_alpha = torch.tensor(start, device=device, requires_grad=True)
+        self.alpha_optimizer = self._adam([self.log_alpha])
+
+    @torch.inference_mode()
+    def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
+        """tanh(u), u ~ N(mu, sigma^2) when exploring, else tanh(mu); see `DDPG.act`."""
+        mean, log_std = self.networks.actor(self._actor_latent(observation))
+        if not explore:
+            return torch.tanh(mean)
+        noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
+        return torch.tanh(mean + log_std.exp() * noise)
+
+    def next_value(self, next_encoded: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+        """min_k Q_phi_k-bar(o_{t+n}, a) - alpha log pi(a | o_{t+n}) of an action a ~ pi, (B,)."""
+        action, log_prob, _ = self._sample(next_encoded, noise)
+        return self.target_q(next_encoded, action) - self.log_alpha.exp() * log_prob
+
+    def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
+        """The actor towards actions of higher soft value; then alpha towards the target entropy."""
+        with self._arithmetic():
+            action, log_prob, mean = self._sample(encoded, noise)
+            q = self.q(encoded, action)
+        alpha = self.log_alpha.exp().detach()
+        loss = (alpha * log_prob - q).mean()
+        step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
+        entropy = -log_prob.detach().mean()
+        target = self.config.target_entropy
+        goal = -action.shape[1] if target is None else target
+        alpha_loss = self.log_alpha.exp() * (entropy - goal)
+        step_optimizer(self.alpha_optimizer, alpha_loss, [self.log_alpha])
+        return {
+            "actor_loss": loss.detach(),
+            "alpha_loss": alpha_loss.detach(),
+            "alpha": alpha,
+            "entropy": entropy,
+            "action_saturation": (torch.tanh(mean.detach()).abs() > 0.95).float().mean(),
+        }
+
+    def epsilon(self, noise: Tensor) -> Tensor:
+        """Standard normal as it is: the policy scales it."""
+        return noise
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next update and the next action depend on."""
+        return super().state_dict() | {
+            "log_alpha": self.log_alpha.detach(),
+            "alpha_optimizer": self.alpha_optimizer.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take back what `state_dict` gave."""
+        super().load_state_dict(state)
+        with torch.no_grad():
+            self.log_alpha.copy_(state["log_alpha"])
+        load_optimizer(self.alpha_optimizer, state["alpha_optimizer"])
+
+    def _sample(
+        self, encoded: Mapping[str, Tensor], noise: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """An action (B, A), its log pi (B,), and mu (B, A); differentiable in the actor."""
+        mean, log_std = self.networks.actor(self.networks.actor_latent(encoded))
+        u = mean + log_std.exp() * noise
+        gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        # log(1 - tanh(u)^2), in a form that does not lose its digits where tanh is near 1
+        squashed = 2 * (math.log(2) - u - softplus(-2 * u))
+        return torch.tanh(u), (gaussian - squashed).sum(-1), mean

@@ -1,0 +1,66 @@
+"""The environment of a run: made from its config, and narrowed to what its agent consumes."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import gymnasium
+from gymnasium import spaces
+from gymnasium.wrappers import FilterObservation
+
+from merl.agents.config import AgentConfig
+from merl.agents.networks import modalities, told_to_critic
+from merl.envs import make_env
+from merl.envs.action_repeat import ActionRepeat
+from merl.envs.config import OBSERVATIONS, EnvConfig
+from merl.training.config import TrainConfig
+
+
+def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
+    """The environment of a run, with fields of its `EnvConfig` (or `render_mode`) changed.
+
+    It gives what the agent consumes and nothing else: what nobody consumes is never rendered.
+
+    Raises:
+        MerlError: there is no such environment, or it lacks what the agent consumes.
+    """
+    render_mode = changes.pop("render_mode", None)
+    seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))
+    settings = {name: getattr(seen, name) for name in type(seen).__dataclass_fields__}
+    env: gymnasium.Env[Any, Any] = make_env(
+        config.task, render_mode=render_mode, **settings | changes
+    )
+    if config.action_repeat > 1:
+        env = ActionRepeat(env, config.action_repeat)
+    try:
+        consumed, _ = run_spaces(config, env)
+    except BaseException:
+        env.close()
+        raise
+    return env if consumed == env.observation_space else FilterObservation(env, tuple(consumed))
+
+
+def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Box]:
+    """What the agent consumes of the observation, and the actions."""
+    space = env.observation_space
+    assert isinstance(space, spaces.Dict)
+    assert isinstance(env.action_space, spaces.Box)
+    images, vectors = modalities(config.agent, space)
+    keys = (*images, *vectors, *told_to_critic(config.agent, space))
+    return spaces.Dict({key: space[key] for key in keys}), env.action_space
+
+
+def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
+    """Of what the Jaco environments can give: what the agent names, else what the config has."""
+    images, vectors = agent.images, agent.vectors
+    default = [
+        name
+        for name in env.observations
+        if (images is None if name == "image" else vectors is None)
+    ]
+    named = {*(images or ()), *(vectors or ()), *agent.critic_vectors}
+    if not named <= set(OBSERVATIONS):  # the agent's check says which there are
+        return OBSERVATIONS
+    asked = [name for name in OBSERVATIONS if name in named or name in default]
+    return tuple(asked) or env.observations

@@ -428,8 +428,17 @@ def test_it_grows_when_opened_with_a_larger_capacity(tmp_path):
     assert run.replay.capacity == 50
     run.play(9, 9, 9, 9, 9)
     check(run.replay, run.account)
-    with pytest.raises(MerlError, match=r"has wrapped .* --replay.capacity 50$"):
-        make(run.directory, capacity=60)
+
+
+def test_a_ring_that_has_wrapped_stays_as_long_as_it_is(tmp_path):
+    run = Run(tmp_path / "replay")
+    run.play(9, 9, 9, 9, 9)
+    held = len(run.replay)
+    run.replay = make(run.directory, capacity=60)
+    assert len(run.replay) == held
+    check(run.replay, run.account)
+    run.play(5, 4)
+    check(run.replay, run.account)
 
 
 def test_opened_with_a_smaller_capacity_it_samples_only_the_newest(tmp_path):

@@ -78,6 +78,16 @@ def test_scales_to_a_size(tmp_path):
     assert decode(tmp_path / "a.mp4")[2].shape == (1, 500, 600, 3)
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "size"),
+    [(84, 84, (504, 504)), (32, 64, (512, 1024)), (500, 479, (1000, 958))],
+)
+def test_small_pictures_are_enlarged(tmp_path, width, height, size):
+    with VideoWriter(tmp_path / "a.mp4") as video:
+        video.add(picture(width=width, height=height))
+    assert decode(tmp_path / "a.mp4")[2].shape[2:0:-1] == size
+
+
 def test_captions_are_legible_low_down_and_change(tmp_path):
     frame = picture()
     with VideoWriter(tmp_path / "a.mp4") as video:
@@ -110,8 +120,6 @@ def test_long_captions_stay_in_their_column(tmp_path):
 @pytest.mark.parametrize(
     "frame",
     [
-        picture(height=479),
-        picture(width=84, height=84),
         picture().astype(np.float32),
         picture()[..., 0],
         np.zeros((3, SIDE, SIDE), dtype=np.uint8),

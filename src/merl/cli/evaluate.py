@@ -58,8 +58,9 @@ def evaluate(args: list[str]) -> int:
         )
     finally:
         env.close()
-    seen = options.renderer or policy.config.env.renderer
-    told = f"{options.run} at step {policy.step:,}, {seen} pictures: {describe(result)}"
+    seen = "" if policy.config.own_env else f", {options.renderer or policy.config.env.renderer}"
+    pictures = f"{seen} pictures" if seen else ""
+    told = f"{options.run} at step {policy.step:,}{pictures}: {describe(result)}"
     console.print(told, highlight=False)
     config = policy.config
     beside = references(config.task, occluded=config.env.occluded)

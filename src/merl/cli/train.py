@@ -16,7 +16,7 @@ from rich.filesize import decimal
 
 from merl.cli.parsing import parse, program
 from merl.cli.summary import summarize
-from merl.core import MerlError
+from merl.core import MerlError, is_image
 from merl.experiments.presets import PRESETS, compose
 from merl.replay import replay_bytes
 from merl.training.checkpoint import Checkpoint
@@ -34,6 +34,16 @@ def train(args: list[str]) -> int:
     default = compose(preset, tyro.MISSING, agent, setting)
     task = parse(TrainConfig, "merl train", args, default=default).task
     config = parse(TrainConfig, "merl train", args, default=compose(preset, task, agent, setting))
+    if config.own_env and config.env != default.env:
+        changed = [
+            f"--{field.name.replace('_', '-')}"
+            for field in dataclasses.fields(config.env)
+            if getattr(config.env, field.name) != getattr(default.env, field.name)
+        ]
+        raise MerlError(
+            f"{', '.join(changed)} is for merl's own tasks: {config.task} decides for itself how "
+            "it is seen"
+        )
     return _train(config, f"preset {preset} ({why}; {PRESETS[preset].about})")
 
 
@@ -120,6 +130,8 @@ def _outlook(trainer: Trainer, what: str, done: int) -> str:
     seconds = timing.seconds(config, done)
     size = replay_bytes(config.replay, trainer.space, trainer.action_space, config.capacity)
     tried = ", ".join(f"{1000 * s:.0f} ms in {how}" for how, s in timing.update.items())
+    seen = not config.own_env and any(is_image(space) for space in trainer.space.values())
+    pictures = f" ({config.env.renderer} pictures)" if seen else ""
     lines = [
         f"{what}: {_amount(config, done)} of {config.task} on {config.device} take about "
         f"{timedelta(seconds=round(seconds))}",
@@ -127,8 +139,7 @@ def _outlook(trainer: Trainer, what: str, done: int) -> str:
     if seconds > 86_400 and config.preset != "laptop":
         lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
     lines += [
-        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms a step "
-        f"({config.env.renderer} pictures)",
+        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms a step{pictures}",
         f"the replay takes {decimal(size)} for {config.capacity:,} steps",
     ]
     if (config.steps - config.seed_steps) * config.updates_per_step < 1:

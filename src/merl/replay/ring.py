@@ -69,7 +69,7 @@ class Replay:
             action_space: a vector.
             directory: where the ring lies, memory-mapped; without one it lies in memory.
             capacity: steps that are kept, in place of the config's. A ring that is opened again
-                grows to it, unless it has wrapped already.
+                grows to it; one that has wrapped stays as long as it is.
 
         Raises:
             MerlError: a space that cannot be kept, a capacity that does not fit, a directory that

@@ -95,13 +95,16 @@ def open_files(
 ) -> dict[str, mmap.mmap]:
     """Create the files, or grow those that are there where they are too short, and map them.
 
+    A ring that has wrapped stays as long as it is: its oldest moments lie behind its newest.
+
     Raises:
         MerlError: the disk is full, the directory cannot be written, or it holds something else.
             What was created is removed again, what was there is as it was.
     """
     header = directory / _HEADER
     header_text = _header_text(fields, slots, capacity)
-    held = _held_slots(header, fields, slots, header_text)
+    held, wrapped = _held_slots(header, fields, header_text)
+    slots = held if wrapped else slots
     paths = {name: directory / f"{name}.bin" for name in fields}
     before = {paths[name]: held * field.bytes for name, field in fields.items()}
     sizes = {paths[name]: max(slots, held) * field.bytes for name, field in fields.items()}
@@ -136,10 +139,14 @@ def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:
         folder.rmdir()
 
 
-def _held_slots(header: Path, fields: dict[str, Field], slots: int, text: str) -> int:
-    """Slots of the ring that lies there, 0 if there is none; checks that it can be gone on with."""
+def _held_slots(header: Path, fields: dict[str, Field], text: str) -> tuple[int, bool]:
+    """Slots of the ring that lies there, 0 if there is none, and whether it has wrapped.
+
+    Raises:
+        MerlError: it cannot be gone on with.
+    """
     if not header.exists():
-        return 0
+        return 0, False
     directory, wanted = header.parent, json.loads(text)
     try:
         found = json.loads(header.read_text())
@@ -157,12 +164,8 @@ def _held_slots(header: Path, fields: dict[str, Field], slots: int, text: str) -
         )
     if not whole:
         raise MerlError(f"{directory} holds a truncated replay: give another folder")
-    if slots > held and np.fromfile(directory / "moment.bin", "<i8", held).max() > held:
-        raise MerlError(
-            f"the replay in {directory} has wrapped and cannot grow: "
-            f"go on with --replay.capacity {found['capacity']}"
-        )
-    return held
+    newest = np.fromfile(directory / "moment.bin", "<i8", held).max(initial=0)
+    return held, bool(newest > held)
 
 
 def _header_text(fields: dict[str, Field], slots: int, capacity: int) -> str:

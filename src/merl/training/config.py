@@ -13,6 +13,7 @@ from merl.agents import AGENTS
 from merl.agents.config import AgentConfig
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
+from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 
 Setting = Literal["matched", "published"]
@@ -47,7 +48,8 @@ class TrainConfig:
     """
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-    """What is to be learnt, e.g. reach_duplo."""
+    """What is to be learnt: reach_duplo, move_box, lift_box, a Gymnasium id, or module:function
+    that makes an environment."""
     preset: str = "paper"
     """paper, laptop, state or smoke: which set of values the others are taken from."""
     agent_name: Annotated[str, tyro.conf.arg(name="agent", metavar="|".join(AGENTS))] = "merl"
@@ -109,9 +111,14 @@ class TrainConfig:
         if self.replay.batch_size > self.capacity:
             raise MerlError(
                 f"replay.batch-size {self.replay.batch_size} is more than the {self.capacity} "
-                "steps of the run, which is all that the replay will hold: use a smaller batch or more "
-                "steps"
+                "steps of the run, which is all that the replay will hold: use a smaller batch or "
+                "more steps"
             )
+
+    @property
+    def own_env(self) -> bool:
+        """Whether the environment is the user's own, not one of merl's tasks."""
+        return self.task not in ENV_IDS
 
     @property
     def capacity(self) -> int:

@@ -14,6 +14,7 @@ from merl.agents.networks import modalities, told_to_critic
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
 from merl.envs.config import OBSERVATIONS, EnvConfig
+from merl.envs.own import make_own
 from merl.training.config import TrainConfig
 
 
@@ -26,11 +27,13 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
         MerlError: there is no such environment, or it lacks what the agent consumes.
     """
     render_mode = changes.pop("render_mode", None)
-    seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))
-    settings = {name: getattr(seen, name) for name in type(seen).__dataclass_fields__}
-    env: gymnasium.Env[Any, Any] = make_env(
-        config.task, render_mode=render_mode, **settings | changes
-    )
+    env: gymnasium.Env[Any, Any]
+    if config.own_env:
+        env = make_own(config.task, render_mode)
+    else:
+        seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))
+        settings = {name: getattr(seen, name) for name in type(seen).__dataclass_fields__}
+        env = make_env(config.task, render_mode=render_mode, **settings | changes)
     if config.action_repeat > 1:
         env = ActionRepeat(env, config.action_repeat)
     try:

@@ -17,6 +17,7 @@ import itertools
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import types
@@ -182,7 +183,8 @@ def run_path(config: TrainConfig) -> Path:
     if config.run_dir is not None:
         return config.run_dir
     agent = config.agent_name if config.setting == "matched" else f"{config.agent_name}-published"
-    name = f"{config.task}-{agent}-{config.preset}-s{config.seed}"
+    task = re.sub(r"[^\w.-]+", "-", config.task)  # `module:function`, `namespace/Id-v0`
+    name = f"{task}-{agent}-{config.preset}-s{config.seed}"
     numbered = (Path("runs") / f"{name}-{number}" for number in itertools.count(2))
     return next(p for p in itertools.chain([Path("runs") / name], numbered) if not _exists(p))
 

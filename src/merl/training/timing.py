@@ -104,7 +104,8 @@ def measure(
     if config.threads is None and cores > threads:
         attempt(Arithmetic(fastest.precision, cores))
     torch.set_num_threads(threads)
-    frame = 0.0 if config.eval.video == "none" else _time_frame(eval_env)
+    films = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
+    frame = _time_frame(eval_env) if films else 0.0
     return Timing(update, _time_step(env) + _time_acting(agent, batch), frame)
 
 
@@ -173,7 +174,9 @@ def _time_step(env: gymnasium.Env[Any, Any]) -> float:
 
     def steps() -> None:
         for _ in range(MEASURED_STEPS):
-            env.step(action)
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
 
     return _median_seconds(steps) / MEASURED_STEPS
 

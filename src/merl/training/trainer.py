@@ -86,6 +86,7 @@ class Trainer:
         timing: what this machine needs for a step and an update.
         env: to act in.
         eval_env: to be evaluated in.
+        films: whether that can be filmed.
         space: what the agent consumes.
         action_space: what it does.
         agent: the learner.
@@ -97,6 +98,7 @@ class Trainer:
         self, config: TrainConfig, env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, Any]
     ) -> None:
         self.env, self.eval_env = env, eval_env
+        self.films = eval_env.render_mode == "rgb_array"
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
         check_memory(config, self.space, self.action_space)
@@ -218,6 +220,8 @@ class _Stretch:
         images = tuple(key for key in trainer.space if is_image(trainer.space[key]))
         frames = FrameStack(self.config.replay.frame_stack, images, trainer.device)
         self.view.begin(self.run, trainer)
+        if not trainer.films and self.config.eval.video != "none":
+            self.view.warn("there will be no videos: the environment does not render to an array")
         self.clock.mark(progress)
         for moment in train(
             trainer.env,
@@ -279,7 +283,7 @@ class _Stretch:
         trainer, config = self.trainer, self.config.eval
         step = trainer.progress.step
         policy = Policy(trainer.agent, self.config, trainer.space, trainer.device, step)
-        film = config.video == "each" or (config.video == "last" and last)
+        film = trainer.films and (config.video == "each" or (config.video == "last" and last))
         try:
             self.evaluation = evaluate(
                 policy,

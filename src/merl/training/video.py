@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Mapping
 from fractions import Fraction
@@ -38,7 +39,8 @@ class VideoWriter:
         path: the file to make, usually `*.mp4`; its folder is made, an existing file replaced.
         fps: pictures a second; real time is one over the time between two added pictures.
         size: (width, height) of the video in pixels, both even; pictures of another size are
-            scaled to it. None: as the first picture, less its last row or column if that is odd.
+            scaled to it. None: as the first picture, less its last row or column if that is odd;
+            one below 480 pixels is enlarged by a whole number.
 
     Raises:
         MerlError: the file cannot be written, or this PyAV has no H.264 encoder.
@@ -91,8 +93,7 @@ class VideoWriter:
         """Append a picture.
 
         Args:
-            frame: (H, W, 3) uint8, RGB, at least 480 pixels a side, each of the first one's shape;
-                it is not changed.
+            frame: (H, W, 3) uint8, RGB, each of the first one's shape; it is not changed.
             caption: what to write on a translucent strip along the lower edge, name -> value, up
                 to about five, side by side in equal columns; give every picture the same names,
                 so that the columns stay where they are.
@@ -152,12 +153,12 @@ class VideoWriter:
     def _check(self, frame: NDArray[np.uint8]) -> None:
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise ValueError(f"a picture is uint8 (H, W, 3), not {frame.dtype} {frame.shape}")
-        if min(frame.shape[:2]) < MIN_SIDE:
-            raise ValueError(
-                f"a picture is at least {MIN_SIDE} pixels a side, not {frame.shape[:2]}"
-            )
         if self._shape is None:
             self._shape = frame.shape
+            times = math.ceil(MIN_SIDE / min(frame.shape[:2]))
+            if self._size is None and times > 1:
+                times += times % 2  # an even size
+                self._size = (times * frame.shape[1], times * frame.shape[0])
         if frame.shape != self._shape:
             raise ValueError(f"a picture {frame.shape} after pictures {self._shape}")
 

@@ -1,0 +1,209 @@
+"""A user's own environment, brought into the form that agents take: any robot, any senses."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import warnings
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import registry
+from gymnasium.wrappers import RescaleAction
+from numpy.typing import NDArray
+
+from merl.core import MerlError, is_image, is_vector, meant
+from merl.envs.registration import ENV_IDS
+
+MOST_CHANNELS = 4
+"""Of an image; where the first axis has so few and the last more, channels come first."""
+
+
+def make_own(task: str, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    """An environment that merl does not bring along, in the form that agents take.
+
+    Args:
+        task: a Gymnasium id (`Pendulum-v1`, `module:Id-v0`), or `module:function`, the function
+            being called without arguments, or with `render_mode` if it knows that.
+        render_mode: what is asked of it; where it cannot render, it is made without.
+
+    Returns:
+        The environment, adapted (`Adapted`).
+
+    Raises:
+        MerlError: there is no such environment, or it cannot be learnt in.
+    """
+    env = _make(task, render_mode)
+    if render_mode is not None and not _renders(env):
+        env.close()
+        env = _make(task, None)
+    try:
+        return adapt(env)
+    except BaseException:
+        env.close()
+        raise
+
+
+def adapt(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """An environment in the form that agents take.
+
+    A plain box of numbers becomes `state`, a plain picture `image`; of a `Dict` the images (uint8
+    boxes) and vectors (boxes of one axis) stay, with a warning for the rest. A box of finite
+    actions is rescaled to [-1, 1]. `info["is_success"]` counts as `success`.
+
+    Raises:
+        MerlError: the actions are not a box of finite bounds, or nothing can be sensed.
+    """
+    actions = env.action_space
+    if not isinstance(actions, spaces.Box) or len(actions.shape) != 1:
+        raise MerlError(
+            f"the environment's actions are {actions}: an agent here gives a box of numbers (n,)"
+        )
+    if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
+        raise MerlError(
+            f"the environment's actions are {actions}: give them finite bounds, which are scaled "
+            "to [-1, 1]"
+        )
+    if actions.dtype != np.float32 or (actions.low != -1).any() or (actions.high != 1).any():
+        env = RescaleAction(env, np.float32(-1.0), np.float32(1.0))
+    return Adapted(env)
+
+
+class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Observations as a `Dict` of images uint8 (H, W, C) and vectors float32 (n,).
+
+    Args:
+        env: whose observations are a box, or a `Dict` of boxes.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        given = env.observation_space
+        self._plain = None if isinstance(given, spaces.Dict) else _plain_key(given)
+        parts = given.spaces if isinstance(given, spaces.Dict) else {str(self._plain): given}
+        taken: dict[str, spaces.Space[Any]] = {}
+        for key, part in parts.items():
+            space = _taken(part)
+            if space is None:
+                warnings.warn(
+                    f"observation {key!r} is not used: {part} is neither an image (uint8, "
+                    "H x W x C) nor a vector (n numbers)",
+                    stacklevel=2,
+                )
+            else:
+                taken[key] = space
+        if not taken:
+            raise MerlError(
+                f"the environment's observation {given} has neither an image (a uint8 box, "
+                "H x W x C) nor a vector (a box of n numbers): wrap it so that it has"
+            )
+        self._spaces = taken
+        self.observation_space = spaces.Dict(taken)
+        self.action_space = spaces.Box(-1.0, 1.0, env.action_space.shape, np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode; see `gymnasium.Env.reset`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._adapted(observation), info
+
+    def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], Any, bool, bool, Any]:
+        """Take an action in [-1, 1]; see `gymnasium.Env.step`."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if "is_success" in info and "success" not in info:
+            info = {**info, "success": info["is_success"]}
+        return self._adapted(observation), float(reward), terminated, truncated, info
+
+    def _adapted(self, observation: Any) -> dict[str, Any]:
+        whole = observation if self._plain is None else {self._plain: observation}
+        return {key: _part(space, whole[key]) for key, space in self._spaces.items()}
+
+
+def _part(space: spaces.Space[Any], value: Any) -> NDArray[Any]:
+    """One modality as its space has it."""
+    array = np.asarray(value)
+    if is_image(space) and array.shape != space.shape:
+        array = array[..., None] if array.ndim == 2 else np.moveaxis(array, 0, -1)
+    return array.astype(space.dtype, copy=False)
+
+
+def _plain_key(space: spaces.Space[Any]) -> str:
+    """The key of an observation that has none."""
+    return "image" if space.dtype == np.uint8 and len(space.shape or ()) > 1 else "state"
+
+
+def _taken(space: spaces.Space[Any]) -> spaces.Box | None:
+    """The space as agents know it; None if it is neither image nor vector."""
+    if not isinstance(space, spaces.Box):
+        return None
+    if is_image(space) or (space.dtype == np.uint8 and len(space.shape) == 2):
+        shape = (*space.shape, 1) if len(space.shape) == 2 else space.shape
+        if shape[0] <= MOST_CHANNELS < shape[2]:
+            shape = (*shape[1:], shape[0])
+        return spaces.Box(0, 255, shape, np.uint8)
+    if is_vector(space) or len(space.shape) == 1:
+        low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+        return spaces.Box(low, high, space.shape, np.float32)
+    return None
+
+
+def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
+    module, colon, name = task.partition(":")
+    if not colon:
+        if task not in registry:
+            way = meant(task, [*ENV_IDS, *registry])
+            if not way.startswith("did"):
+                way = f"choose from {', '.join(ENV_IDS)}, or name a Gymnasium id or module:function"
+            raise MerlError(f"task {task!r} is unknown: {way}")
+        return _by_id(task, render_mode)
+    here = str(Path.cwd())  # where `python` would look, and the command line does not
+    if here not in sys.path:
+        sys.path.append(here)
+    try:
+        found = import_module(module)
+    except ImportError as error:
+        raise MerlError(f"task {task!r}: module {module!r} cannot be imported: {error}") from None
+    make = getattr(found, name, None)
+    if make is None:
+        if name in registry:
+            return _by_id(name, render_mode)
+        raise MerlError(
+            f"task {task!r}: module {module!r} has no function {name!r}, and registers no "
+            "environment of that name"
+        )
+    if not callable(make):
+        raise MerlError(f"task {task!r}: {name!r} is no function that makes an environment")
+    knows = "render_mode" in inspect.signature(make).parameters
+    env = make(render_mode=render_mode) if knows else make()
+    if not isinstance(env, gymnasium.Env):
+        raise MerlError(f"task {task!r}: {name!r} gave {type(env).__name__}, not a gymnasium.Env")
+    return env
+
+
+def _renders(env: gymnasium.Env[Any, Any]) -> bool:
+    """Whether it draws; what it draws with may not be installed."""
+    if env.render_mode is None:
+        return False
+    try:
+        env.reset(seed=0)
+        return env.render() is not None
+    except (gymnasium.error.Error, ImportError) as error:
+        warnings.warn(f"the environment cannot be filmed: {error}", stacklevel=2)
+        return False
+
+
+def _by_id(env_id: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
+    try:
+        if render_mode is not None:
+            try:
+                return gymnasium.make(env_id, render_mode=render_mode)
+            except (TypeError, gymnasium.error.Error):  # it cannot render so
+                pass
+        return gymnasium.make(env_id)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise MerlError(f"task {env_id!r} cannot be made: {error}") from None

@@ -1,0 +1,159 @@
+"""A user's own environment: found by name, brought into the agents' form, refused in one line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+
+from merl.core import MerlError
+from merl.envs.own import adapt, make_own
+
+
+class Given(gymnasium.Env[Any, Any]):
+    """Gives what it is told to."""
+
+    def __init__(self, space: spaces.Space[Any], actions: spaces.Space[Any] | None = None) -> None:
+        self.observation_space = space
+        self.action_space = actions or spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.observation_space.seed(0)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        self.acted = action
+        return self.observation_space.sample(), np.float64(1.5), False, True, {"is_success": True}
+
+
+def image(*shape: int) -> spaces.Box:
+    return spaces.Box(0, 255, shape, np.uint8)
+
+
+def vector(n: int, dtype: type = np.float32) -> spaces.Box:
+    return spaces.Box(-9, 9, (n,), dtype)
+
+
+@pytest.mark.parametrize(
+    ("given", "taken"),
+    [
+        (vector(3), {"state": (3,)}),
+        (vector(3, np.float64), {"state": (3,)}),
+        (spaces.Box(0, 255, (128,), np.uint8), {"state": (128,)}),
+        (image(20, 30, 3), {"image": (20, 30, 3)}),
+        (image(20, 30), {"image": (20, 30, 1)}),
+        (image(3, 20, 30), {"image": (20, 30, 3)}),
+        (
+            spaces.Dict({"top": image(20, 20, 3), "arm": vector(7, np.float64)}),
+            {"arm": (7,), "top": (20, 20, 3)},
+        ),
+    ],
+)
+def test_observations_become_images_and_vectors(given: Any, taken: dict[str, Any]) -> None:
+    env = adapt(Given(given))
+    assert isinstance(env.observation_space, spaces.Dict)
+    assert {key: space.shape for key, space in env.observation_space.items()} == taken
+    for space in env.observation_space.values():
+        assert space.dtype == (np.uint8 if len(space.shape or ()) == 3 else np.float32)
+    for observation in (env.reset(seed=0)[0], env.step(np.zeros(2, np.float32))[0]):
+        assert env.observation_space.contains(observation)
+
+
+def test_channels_that_come_first_are_moved_not_mixed() -> None:
+    plain, own = Given(image(3, 20, 30)), adapt(Given(image(3, 20, 30)))
+    before, after = plain.reset()[0], own.reset()[0]["image"]
+    for channel in range(3):
+        np.testing.assert_array_equal(after[..., channel], before[channel])
+
+
+def test_what_is_neither_image_nor_vector_is_left_out_with_a_word() -> None:
+    space = spaces.Dict({"arm": vector(2), "gear": spaces.Discrete(3), "map": vector(4)})
+    with pytest.warns(UserWarning, match=r"'gear' is not used: Discrete\(3\)"):
+        env = adapt(Given(space))
+    assert set(env.observation_space) == {"arm", "map"}  # type: ignore[call-overload]
+    assert set(env.reset()[0]) == {"arm", "map"}
+
+
+def test_actions_are_rescaled_and_success_is_found() -> None:
+    low, high = np.array([-2.0, 0.0]), np.array([2.0, 10.0])
+    given = Given(vector(2), spaces.Box(low, high, dtype=np.float64))
+    env = adapt(given)
+    assert env.action_space == spaces.Box(-1.0, 1.0, (2,), np.float32)
+    env.reset(seed=0)
+    for action, expected in (((-1, -1), low), ((0, 0), (0, 5)), ((1, 1), high)):
+        _, reward, _, truncated, info = env.step(np.array(action, np.float32))
+        np.testing.assert_allclose(given.acted, expected)
+    assert (reward, truncated, info["success"]) == (1.5, True, True)
+
+
+@pytest.mark.parametrize(
+    ("space", "actions", "says"),
+    [
+        (vector(2), spaces.Discrete(4), r"actions are Discrete\(4\)"),
+        (vector(2), spaces.Box(-np.inf, np.inf, (2,)), "give them finite bounds"),
+        (vector(2), spaces.Box(-1, 1, (2, 2)), "a box of numbers"),
+        (spaces.Discrete(5), None, "neither an image"),
+        (spaces.Dict({"a": spaces.Dict({"b": vector(2)})}), None, "neither an image"),
+        (spaces.Box(-1, 1, (4, 4), np.float32), None, "neither an image"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:observation")
+def test_what_cannot_be_learnt_in_is_refused(space: Any, actions: Any, says: str) -> None:
+    with pytest.raises(MerlError, match=says):
+        adapt(Given(space, actions))
+
+
+def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> None:
+    pendulum = make_own("Pendulum-v1", "rgb_array")
+    assert pendulum.render_mode == "rgb_array"
+    assert set(pendulum.observation_space) == {"state"}  # type: ignore[call-overload]
+    (tmp_path / "my_robot_here.py").write_text(
+        "import gymnasium\n"
+        "def make():\n    return gymnasium.make('Pendulum-v1', g=1.0)\n"
+        "def number():\n    return 3\n"
+        "limit = 3\n"
+        "gymnasium.register('Robot-v7', entry_point=make)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
+    assert make_own("my_robot_here:make").unwrapped.g == 1.0  # type: ignore[attr-defined]
+    assert make_own("my_robot_here:Robot-v7", "rgb_array").render_mode is None
+    for task, says in {
+        "Pendulm-v1": "did you mean 'Pendulum-v1'",
+        "reach_dulpo": "did you mean 'reach_duplo'",
+        "zzz": "choose from reach_duplo, move_box, lift_box, or name a Gymnasium id",
+        "no_such_module:make": "cannot be imported",
+        "my_robot_here:maker": "has no function 'maker'",
+        "my_robot_here:limit": "is no function",
+        "my_robot_here:number": "gave int",
+        "CartPole-v1": "Discrete",
+    }.items():
+        with pytest.raises(MerlError, match=says):
+            make_own(task)
+
+
+@pytest.mark.parametrize("task", ["merl.envs.dot:whole", "merl.envs.dot:split"])
+def test_the_dot(task: str) -> None:
+    env = make_own(task, "rgb_array")
+    check_env(env.unwrapped, skip_render_check=True)
+    returns = {}
+    for name in ("straight", "still"):
+        env.reset(seed=1)
+        total, over = 0.0, False
+        while not over:
+            action = env.unwrapped.best_action()  # type: ignore[attr-defined]
+            if name == "still":
+                action = 0 * action
+            _, reward, _, over, _ = env.step(action)
+            total += float(reward)
+        returns[name] = total
+    assert returns["still"] < returns["straight"] <= 20
+    assert env.reset(seed=1)[0]["image"][..., 0].any() == task.endswith("whole")
+    assert np.asarray(env.render())[..., 0].any()

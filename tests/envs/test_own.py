@@ -111,8 +111,8 @@ def test_what_cannot_be_learnt_in_is_refused(space: Any, actions: Any, says: str
 
 
 def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> None:
-    pendulum = make_own("Pendulum-v1", "rgb_array")
-    assert pendulum.render_mode == "rgb_array"
+    assert make_own("merl.envs.dot:whole", "rgb_array").render_mode == "rgb_array"
+    pendulum = make_own("Pendulum-v1")
     assert set(pendulum.observation_space) == {"state"}  # type: ignore[call-overload]
     (tmp_path / "my_robot_here.py").write_text(
         "import gymnasium\n"

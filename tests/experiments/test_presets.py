@@ -1,5 +1,7 @@
 """Presets are values: the paper's numbers, what a task changes in them, and what an agent does."""
 
+import dataclasses
+
 import pytest
 
 from merl.agents import AGENTS
@@ -45,9 +47,12 @@ def test_every_preset_takes_every_agent() -> None:
 def test_published_is_what_the_authors_ran() -> None:
     drqv2 = compose("paper", "reach_duplo", "drqv2", "published")
     assert (drqv2.action_repeat, drqv2.updates_per_step) == (2, 0.25)
-    assert drqv2.agent == AGENTS["drqv2"]
-    assert (drqv2.agent.noise(0), drqv2.agent.noise(250_000)) == (1.0, pytest.approx(0.55))
+    # 500,000 decisions of two steps each
+    assert (drqv2.agent.noise(0), drqv2.agent.noise(500_000)) == (1.0, pytest.approx(0.55))
     assert drqv2.agent.noise(10**7) == pytest.approx(0.1)
+    assert drqv2.agent == dataclasses.replace(AGENTS["drqv2"], noise_steps=1_000_000)
+    ddpg = compose("state", "reach_duplo", "ddpg", "published").agent
+    assert (ddpg.noise_std, ddpg.noise_clip, ddpg.hidden_dim) == (0.1, 0.0, 256)
     sac = compose("state", "reach_duplo", "sac", "published")
     assert (sac.replay.n_step, sac.agent.learning_rate, sac.agent.tau) == (1, 3e-4, 0.005)
     for name in PUBLISHED:

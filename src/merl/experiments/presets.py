@@ -109,20 +109,27 @@ class Published:
 
 PUBLISHED: dict[str, Published] = {
     # Its own repository, for its tasks of medium difficulty: an action is held for two steps, an
-    # update every second decision, 2000 random decisions.
+    # update every second decision, 2000 random decisions, noise that falls over 500,000 decisions.
     "drqv2": Published(
         {"action_repeat": 2, "updates_per_step": 0.25, "random_steps": 4000, "seed_steps": 4000},
         {"batch_size": 256},
+        {"noise_steps": 1_000_000},
     ),
-    # TD3's own repository, of whose critic this is; TD3's paper has layers of 400 and 300.
+    # TD3's own repository, whose DDPG acts with noise and learns without.
     "ddpg": Published(
         {"updates_per_step": 1.0, "random_steps": 25_000, "seed_steps": 25_000},
         {"batch_size": 256},
-        {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256, "noise_std": 0.1},
+        {
+            "learning_rate": 3e-4,
+            "tau": 0.005,
+            "hidden_dim": 256,
+            "noise_std": 0.1,
+            "noise_clip": 0.0,
+        },
     ),
     # Haarnoja et al. 2018b, Table 1, and its own repository for the random start.
     "sac": Published(
-        {"updates_per_step": 1.0, "random_steps": 10_000, "seed_steps": 10_000},
+        {"updates_per_step": 1.0, "random_steps": 1000, "seed_steps": 1000},
         {"batch_size": 256, "n_step": 1},
         {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
     ),

@@ -327,15 +327,22 @@ def _axis_name(name: str) -> str:
     return special.get(name, f"{words.get(room, room)} {what.replace('_', ' ')}".strip())
 
 
+_TITLE = ("task", "agent", "preset", "setting")
+
+
 def _title(run_dir: Run) -> str:
-    """Task, preset and seed from the run's `config.json`, as far as it tells them."""
+    """Task, agent, preset and seed from the run's `config.json`, as far as it tells them.
+
+    Whose settings a baseline has is told too: it is not the same method with others.
+    """
     path = Path(run_dir)
     try:
         config: Any = json.loads((path / CONFIG_FILE).read_text())
     except (OSError, ValueError):
         config = {}
     config = config if isinstance(config, dict) else {}
-    parts = [str(config[key]) for key in ("task", "preset") if config.get(key)]
+    keys = ("task", "agent", "preset") if config.get("agent") == "merl" else _TITLE
+    parts = [config[key] for key in keys if isinstance(config.get(key), str)]
     if config.get("seed") is not None:
         parts.append(f"seed {config['seed']}")
     name = path.parent if path.name == METRICS_FILE else path

@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# Learning curves of the state-based agents on the three tasks: preset state, one core a run.
+# A run that is done is not run again; one that was stopped goes on. Its numbers are copied to
+# docs/data/agents. Two at once on two cores:
+#     docs/measure_agents.sh 0 & docs/measure_agents.sh 1 & wait
+# STEPS (100000), AGENTS, TASKS and SETTING (matched or published) may be set.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+steps=${STEPS:-100000} setting=${SETTING:-matched}
+[ $# -gt 0 ] || set -- 0
+mkdir -p docs/data/agents
+for seed in "$@"; do
+  for task in ${TASKS:-reach_duplo move_box lift_box}; do
+    for agent in ${AGENTS:-ddpg sac merl_state}; do
+      name=$task-$agent-$setting-s$seed run=runs/agents/$task-$agent-$setting-s$seed
+      if [ ! -d "$run" ]; then
+        merl train "$task" --agent "$agent" --setting "$setting" --preset state --steps "$steps" \
+          --seed "$seed" --eval.video none --run-dir "$run"
+      else
+        merl resume "$run" --steps "$steps"
+      fi
+      cp "$run/metrics.csv" "docs/data/agents/$name.csv"
+      merl evaluate "$run" --episodes 50 --json "docs/data/agents/$name-evaluation.json"
+    done
+  done
+done

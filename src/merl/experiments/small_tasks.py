@@ -1,0 +1,115 @@
+"""Small tasks whose answer is known: does an agent learn at all, and what is each sense good for?
+
+Every one is learnt in a minute or a few on one core. `docs/measure_small_tasks.py` runs them over
+seeds, the tests hold them to their bars.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from merl.agents import AGENTS
+from merl.envs.config import EnvConfig
+from merl.envs.own import make_own
+from merl.replay import ReplayConfig
+from merl.training.config import EvaluationConfig, TrainConfig
+from merl.training.evaluation import EVALUATION_SEED, Evaluation
+from merl.training.loop import Moment
+from merl.training.run import Run
+from merl.training.trainer import Trainer
+
+WHOLE, SPLIT, PENDULUM = "merl.envs.dot:whole", "merl.envs.dot:split", "Pendulum-v1"
+CASES = (
+    (WHOLE, "merl", 8000),
+    (WHOLE, "drqv2", 8000),
+    (SPLIT, "merl", 8000),
+    (SPLIT, "drqv2", 8000),
+    (SPLIT, "proprio", 8000),
+    (PENDULUM, "ddpg", 20_000),
+    (PENDULUM, "sac", 20_000),
+)
+"""Task, agent, steps: what is shown in docs/small_tasks.md."""
+
+_SMALL: dict[str, Any] = {"hidden_dim": 128, "learning_rate": 1e-3, "precision": "fp32"}
+_CAMERA: dict[str, Any] = {"conv_channels": 16, "conv_strides": (2, 2, 1), "shift_pad": 1}
+
+
+def small_config(task: str, agent: str, *, seed: int, steps: int, run_dir: Path) -> TrainConfig:
+    """How an agent is trained on a small task."""
+    chosen = AGENTS[agent]
+    values = _SMALL if task == PENDULUM else _SMALL | _CAMERA
+    if chosen.noise_std_end is not None:
+        values = values | {"noise_steps": steps // 2}
+    return TrainConfig(
+        task,
+        preset="small",
+        agent_name=agent,
+        seed=seed,
+        steps=steps,
+        run_dir=run_dir,
+        device="cpu",
+        threads=1,
+        random_steps=1000,
+        seed_steps=1000,
+        save_every=1e6,
+        env=EnvConfig(renderer="warp"),
+        replay=ReplayConfig(batch_size=64, frame_stack=1 if task != PENDULUM else 3),
+        agent=dataclasses.replace(chosen, **values),
+        eval=EvaluationConfig(every=steps, episodes=20, video="none"),
+    )
+
+
+def learn(task: str, agent: str, *, seed: int, steps: int, run_dir: Path) -> Evaluation:
+    """Train, and evaluate over 20 episodes without noise."""
+    config = small_config(task, agent, seed=seed, steps=steps, run_dir=run_dir)
+    with Trainer.prepare(config, new=True) as trainer:
+        outcome = trainer.start(_Silent())
+    assert outcome.evaluation is not None
+    return outcome.evaluation
+
+
+def returns_of(act: Callable[[Any], Any], task: str, episodes: int = 20) -> list[float]:
+    """What acting so is paid, from the evaluation's starts; `act` is given the environment."""
+    env = make_own(task)
+    returns = []
+    for index in range(episodes):
+        env.reset(seed=EVALUATION_SEED + index)
+        total, over = 0.0, False
+        while not over:
+            _, reward, terminated, truncated, _ = env.step(act(env.unwrapped))
+            total, over = total + float(reward), terminated or truncated
+        returns.append(total)
+    env.close()
+    return returns
+
+
+def optimum(task: str) -> float:
+    """The mean return of going straight to the mark."""
+    return float(np.mean(returns_of(lambda env: env.best_action(), task)))
+
+
+class _Silent:
+    """Watches and says nothing."""
+
+    def begin(self, run: Run, trainer: Trainer) -> None:
+        pass
+
+    def moment(self, moment: Moment, metrics: dict[str, float]) -> None:
+        pass
+
+    def evaluating(self, episode: int, total: int) -> None:
+        pass
+
+    def evaluated(self, step: int, evaluation: Evaluation) -> None:
+        pass
+
+    def saved(self, step: int) -> None:
+        pass
+
+    def warn(self, message: str) -> None:
+        pass

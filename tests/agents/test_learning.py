@@ -1,0 +1,57 @@
+"""Agents learn small tasks whose answer is known; docs/small_tasks.md has the figures."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from merl.experiments.small_tasks import (
+    CASES,
+    PENDULUM,
+    SPLIT,
+    WHOLE,
+    learn,
+    optimum,
+    returns_of,
+)
+from merl.statistics import bootstrap_interval
+
+STEPS = {(task, agent): steps for task, agent, steps in CASES}
+
+
+def mean_return(task: str, agent: str, seed: int, folder: Path, steps: int | None = None) -> float:
+    run = folder / f"{agent}-{seed}"
+    steps = steps or STEPS[task, agent]
+    return learn(task, agent, seed=seed, steps=steps, run_dir=run).returns.mean
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("agent", "seed"), product(("ddpg", "sac"), range(3)))
+def test_pendulum_is_swung_up(agent: str, seed: int, tmp_path: Path) -> None:
+    assert mean_return(PENDULUM, agent, seed, tmp_path) > -250
+
+
+@pytest.mark.parametrize("agent", ["ddpg", "sac"])
+def test_pendulum_soon_swings_better_than_at_rest(agent: str, tmp_path: Path) -> None:
+    still = returns_of(lambda env: env.action_space.low * 0, PENDULUM)
+    early = mean_return(PENDULUM, agent, 0, tmp_path, steps=4000)
+    assert early > sum(still) / len(still) / 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("agent", ["merl", "drqv2"])
+def test_the_dot_is_steered_to_the_mark(agent: str, tmp_path: Path) -> None:
+    assert mean_return(WHOLE, agent, 0, tmp_path) > 0.9 * optimum(WHOLE)
+
+
+@pytest.mark.long
+def test_only_with_both_senses_the_split_task_is_solved(tmp_path: Path) -> None:
+    intervals = {
+        agent: bootstrap_interval([mean_return(SPLIT, agent, seed, tmp_path) for seed in range(5)])
+        for agent in ("merl", "drqv2", "proprio")
+    }
+    assert intervals["merl"].mean > 0.85 * optimum(SPLIT)
+    for alone in ("drqv2", "proprio"):
+        assert intervals[alone].high < intervals["merl"].low

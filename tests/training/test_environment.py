@@ -1,0 +1,70 @@
+"""A run's environment gives what its agent consumes and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from merl.agents import AGENTS
+from merl.core import MerlError
+from merl.envs.config import EnvConfig
+from merl.training.config import TrainConfig
+from merl.training.environment import make_run_env, run_spaces
+
+WARP = EnvConfig(renderer="warp", image_size=32)
+
+
+@pytest.mark.parametrize(
+    ("agent", "keys"),
+    [
+        ("merl", {"image", "proprio"}),
+        ("drqv2", {"image"}),
+        ("proprio", {"proprio"}),
+        ("merl_state", {"state"}),
+        ("ddpg", {"state"}),
+        ("sac", {"state"}),
+    ],
+)
+def test_it_gives_what_its_agent_senses(agent: str, keys: set[str]) -> None:
+    config = TrainConfig("reach_duplo", agent_name=agent, agent=AGENTS[agent], env=WARP)
+    env = make_run_env(config)
+    space, _ = run_spaces(config, env)
+    assert set(space) == set(env.observation_space) == keys  # type: ignore[call-overload]
+    assert set(env.reset(seed=0)[0]) == keys
+    assert env.unwrapped.config.observations == tuple(  # type: ignore[attr-defined]
+        name for name in ("image", "proprio", "state") if name in keys
+    )  # nothing else was computed and thrown away
+    env.close()
+
+
+def test_what_the_critic_is_told_is_there_too() -> None:
+    agent = dataclasses.replace(AGENTS["merl"], critic_vectors=("state",))
+    env = make_run_env(TrainConfig("reach_duplo", agent=agent, env=WARP))
+    assert set(env.reset(seed=0)[0]) == {"image", "proprio", "state"}
+    env.close()
+
+
+def test_the_dot_is_narrowed_as_well() -> None:
+    config = TrainConfig("merl.envs.dot:whole", agent_name="drqv2", agent=AGENTS["drqv2"])
+    env = make_run_env(config)
+    assert set(env.observation_space) == set(env.reset(seed=0)[0]) == {"image"}  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"critic_vectors": ("proprio",)}, "which the actor has already"),
+        ({"critic_vectors": ("touch",)}, "agent.critic-vectors names 'touch'"),
+        ({"critic_vectors": ("state",), "fusion": "shared"}, "use --agent.fusion decoupled"),
+        (
+            {"images": ("wrist",)},
+            r"agent.images names 'wrist', but the environment gives \['image'",
+        ),
+        ({"images": (), "vectors": ()}, "finds nothing to sense"),
+    ],
+)
+def test_what_does_not_fit_is_named(change: dict, says: str) -> None:  # type: ignore[type-arg]
+    agent = dataclasses.replace(AGENTS["merl"], **change)
+    with pytest.raises(MerlError, match=says):
+        make_run_env(TrainConfig("reach_duplo", agent=agent, env=WARP))

@@ -1,21 +1,22 @@
 #!/usr/bin/env bash
-# Learning curves of the state-based agents on the three tasks: preset state, one core a run.
+# Learning curves of agents on the three tasks, one core a run; by default the state-based ones.
 # A run that is done is not run again; one that was stopped goes on. Its numbers are copied to
 # docs/data/agents. Two at once on two cores:
 #     docs/measure_agents.sh 0 & docs/measure_agents.sh 1 & wait
-# STEPS (100000), AGENTS, TASKS and SETTING (matched or published) may be set.
+# PRESET (state), STEPS (100000), AGENTS, TASKS and SETTING (matched or published) may be set:
+#     PRESET=laptop STEPS=100000 TASKS=reach_duplo AGENTS="merl drqv2 proprio" docs/measure_agents.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
-steps=${STEPS:-100000} setting=${SETTING:-matched}
+preset=${PRESET:-state} steps=${STEPS:-100000} setting=${SETTING:-matched}
 [ $# -gt 0 ] || set -- 0
 mkdir -p docs/data/agents
 for seed in "$@"; do
   for task in ${TASKS:-reach_duplo move_box lift_box}; do
     for agent in ${AGENTS:-ddpg sac merl_state}; do
-      name=$task-$agent-$setting-s$seed run=runs/agents/$task-$agent-$setting-s$seed
+      name=$task-$agent-$preset-$setting-s$seed; run=runs/agents/$name
       if [ ! -d "$run" ]; then
-        merl train "$task" --agent "$agent" --setting "$setting" --preset state --steps "$steps" \
-          --seed "$seed" --eval.video none --run-dir "$run"
+        merl train "$task" --agent "$agent" --setting "$setting" --preset "$preset" --steps "$steps" \
+          --seed "$seed" --threads 1 --eval.video none --run-dir "$run"
       else
         merl resume "$run" --steps "$steps"
       fi

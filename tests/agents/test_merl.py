@@ -73,8 +73,18 @@ def test_all_but_the_state_is_sensed() -> None:
         ({"images": ("camera",)}, "names 'camera'"),
         ({"images": ("proprio",)}, "names 'proprio'"),
         ({"vectors": ("joints",)}, "names 'joints'"),
-        ({"images": (), "vectors": ()}, "nothing to sense"),
-        ({"latent_dim": 127}, "127 does not split evenly"),
+        ({"images": (), "vectors": ()}, "it needs an image"),
+        ({"images": (), "vectors": None, "critic_vectors": ("image",)}, "names 'image'"),
+        ({"latent_dim": 127}, "127 does not split evenly over 2 modalities"),
+        (
+            {"latent_dim": 127, "critic_vectors": ("state",)},
+            r"over 2 modalities \(image, proprio\): use a multiple of 2",
+        ),
+        ({"latent_dim": 24, "squash": "simplex"}, "multiple of 8 per modality, not 12: use .* 16"),
+        (
+            {"latent_dim": 120, "squash": "simplex", "critic_vectors": ("state",)},
+            "not 60: use agent.latent-dim 16",
+        ),
         ({"conv_strides": (4, 4, 4, 4)}, "84x84 pixels is too small"),
     ],
 )

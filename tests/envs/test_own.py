@@ -84,6 +84,15 @@ def test_what_is_neither_image_nor_vector_is_left_out_with_a_word() -> None:
 def test_actions_are_rescaled_and_success_is_found() -> None:
     low, high = np.array([-2.0, 0.0]), np.array([2.0, 10.0])
     given = Given(vector(2), spaces.Box(low, high, dtype=np.float64))
+    rng = np.random.default_rng(0)
+    for _ in range(200):  # never beyond the bounds, by no rounding
+        ends = np.sort(rng.normal(size=(2, 2)).astype(np.float32), axis=0)
+        odd = Given(vector(2), spaces.Box(*ends))
+        own = adapt(odd)
+        own.reset(seed=0)
+        for action in (-np.ones(2, np.float32), np.ones(2, np.float32)):
+            own.step(action)
+            assert odd.action_space.contains(odd.acted)
     env = adapt(given)
     assert env.action_space == spaces.Box(-1.0, 1.0, (2,), np.float32)
     env.reset(seed=0)
@@ -98,7 +107,8 @@ def test_actions_are_rescaled_and_success_is_found() -> None:
     [
         (vector(2), spaces.Discrete(4), r"actions are Discrete\(4\)"),
         (vector(2), spaces.Box(-np.inf, np.inf, (2,)), "give them finite bounds"),
-        (vector(2), spaces.Box(-1, 1, (2, 2)), "a box of numbers"),
+        (vector(2), spaces.Box(-1, 1, (2, 2)), "a box of real numbers"),
+        (vector(2), spaces.Box(-9, 9, (2,), np.int32), "a box of real numbers"),
         (spaces.Discrete(5), None, "neither an image"),
         (spaces.Dict({"a": spaces.Dict({"b": vector(2)})}), None, "neither an image"),
         (spaces.Box(-1, 1, (4, 4), np.float32), None, "neither an image"),
@@ -129,14 +139,34 @@ def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> 
         "Pendulm-v1": "did you mean 'Pendulum-v1'",
         "reach_dulpo": "did you mean 'reach_duplo'",
         "zzz": "choose from reach_duplo, move_box, lift_box, or name a Gymnasium id",
-        "no_such_module:make": "cannot be imported",
+        "no_such_module:make": "call merl where it lies",
         "my_robot_here:maker": "has no function 'maker'",
-        "my_robot_here:limit": "is no function",
+        "my_robot_here:limit": "a function is needed",
         "my_robot_here:number": "gave int",
         "CartPole-v1": "Discrete",
     }.items():
         with pytest.raises(MerlError, match=says):
             make_own(task)
+
+
+class Lying(Given):
+    """Says uint8 and gives floats, or leaves a key out."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        observation, info = super().reset(seed=seed)
+        observation.pop("arm")
+        observation["top"] = observation["top"] / 255
+        return observation, info
+
+
+@pytest.mark.parametrize(("keys", "says"), [(("top",), "is of float64"), (("arm",), "lacks 'arm'")])
+def test_what_an_environment_gives_is_held_to_its_space(keys: tuple[str], says: str) -> None:
+    parts = {"top": image(20, 20, 3), "arm": vector(2)}
+    env = Lying(spaces.Dict(parts))
+    own = adapt(env)
+    own._spaces = {key: own._spaces[key] for key in keys}  # type: ignore[attr-defined]
+    with pytest.raises(MerlError, match=says):
+        own.reset()
 
 
 @pytest.mark.parametrize("task", ["merl.envs.dot:whole", "merl.envs.dot:split"])

@@ -2,22 +2,25 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from merl.agents import make_agent
+from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
-from merl.core import MerlError
+from merl.agents.sac import SACConfig
+from merl.core import Batch, MerlError
 from merl.training.checkpoint import Checkpoint, load_agent, save
 from toy import DotEnv
 
 CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")
 
 
-def agent(seed: int = 0, config: MERLConfig = CONFIG) -> DDPG:
+def agent(seed: int = 0, config: AgentConfig = CONFIG) -> DDPG:
     env = DotEnv()
     return make_agent(
         config,
@@ -29,18 +32,44 @@ def agent(seed: int = 0, config: MERLConfig = CONFIG) -> DDPG:
     )
 
 
+def batch_of(of: DDPG) -> Batch:
+    generator = torch.Generator().manual_seed(0)
+    observation = {
+        "image": torch.randint(0, 256, (4, 3, 16, 16, 3), dtype=torch.uint8, generator=generator),
+        "joint": torch.randn(4, 2, generator=generator),
+    }
+    action, rest = torch.rand(4, 1, generator=generator), torch.ones(4)
+    return Batch(observation, action, rest, rest, observation)
+
+
 def weights(of: DDPG) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in of.networks.parameters()])
 
 
-def test_round_trip(tmp_path: Path) -> None:
-    saved, other = agent(0), agent(1)
+@pytest.mark.parametrize(
+    "config",
+    [
+        CONFIG,
+        replace(CONFIG, fusion="shared"),
+        replace(CONFIG, fusion="shared_by_both", target="heads_and_fusion"),
+        replace(CONFIG, latent_dim=0),
+        SACConfig(images=None, vectors=None, hidden_dim=16, precision="bf16"),
+    ],
+    ids=lambda config: f"{type(config).__name__}-{config.fusion}-{config.latent_dim}",
+)
+def test_round_trip(tmp_path: Path, config: AgentConfig) -> None:
+    saved, other = agent(0, config), agent(1, config)
+    for one in (saved, other):
+        one.update(batch_of(one))
     save(tmp_path, 250, saved, {"a": 1}, score=2.5, keep=2)
     found = Checkpoint.find(tmp_path)
     load_agent(other, found)
     assert (found.step, found.score, found.state()) == (250, 2.5, {"a": 1})
     assert torch.equal(weights(saved), weights(other))
     assert torch.equal(saved.learning.get_state(), other.learning.get_state())
+    for one in (saved, other):
+        one.update(batch_of(one))
+    assert torch.equal(weights(saved), weights(other))
 
 
 def test_keeps_the_last_and_the_best(tmp_path: Path) -> None:

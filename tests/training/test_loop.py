@@ -66,6 +66,19 @@ def test_updates_per_step_are_held_exactly(ratio: float) -> None:
     assert moment.step == 60
 
 
+def test_the_agent_is_told_the_step() -> None:
+    """On which its noise depends, when acting and when learning."""
+    agent = dataclasses.replace(CONFIG.agent, noise_std=1.0, noise_std_end=0.0, noise_steps=60)
+    parts = Parts(dataclasses.replace(CONFIG, agent=agent, action_repeat=2))
+    act, update, told = parts.agent.act, parts.agent.update, []
+    parts.agent.act = lambda *a, **k: (told.append(parts.agent.step), act(*a, **k))[1]  # type: ignore[method-assign]
+    parts.agent.update = lambda b: (told.append(parts.agent.step), update(b))[1]  # type: ignore[method-assign]
+    parts.run()
+    assert told[:4] == [10, 12, 14, 16]  # a step of the loop is two of the environment
+    assert max(told) == 58
+    assert parts.agent.config.noise(parts.agent.step) == pytest.approx(1 - 58 / 60)
+
+
 def test_yields_every_step_and_tells_of_each_episode() -> None:
     moments = Parts().run()
     assert [m.step for m in moments] == list(range(1, 61))
@@ -140,3 +153,14 @@ def test_an_episode_sums_what_its_steps_bring() -> None:
     silent = Episode()
     silent.add(1.0, {})
     assert silent.metrics() == {"return": 1.0, "length": 1.0}
+
+
+def test_a_frame_that_is_refilled_does_not_change_the_stack() -> None:
+    """A camera driver may hand out one and the same array again and again."""
+    buffer = np.zeros((2, 2, 1), np.uint8)
+    stack = FrameStack(3, ("camera",), CPU)
+    stack.reset({"camera": buffer})
+    for value in (1, 2):
+        buffer[:] = value
+        stack.push({"camera": buffer})
+    assert stack.observation()["camera"][0, :, 0, 0, 0].tolist() == [0, 1, 2]

@@ -126,7 +126,7 @@ def test_long_captions_stay_in_their_column(tmp_path):
     ],
 )
 def test_refuses_what_is_no_picture(tmp_path, frame):
-    with pytest.raises(ValueError, match="picture"), VideoWriter(tmp_path / "a.mp4") as video:
+    with pytest.raises(MerlError, match="picture"), VideoWriter(tmp_path / "a.mp4") as video:
         video.add(frame)
     assert names(tmp_path) == []
 
@@ -134,7 +134,7 @@ def test_refuses_what_is_no_picture(tmp_path, frame):
 def test_refuses_a_picture_of_another_shape_and_odd_sizes(tmp_path):
     video = VideoWriter(tmp_path / "a.mp4")
     video.add(picture())
-    with pytest.raises(ValueError, match="after"):
+    with pytest.raises(MerlError, match="after"):
         video.add(picture(height=500))
     video.abort()
     for size in ((481, 480), (480, 478)):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from merl.agents.config import AgentConfig
 from merl.core import MerlError, is_image, is_vector
 from merl.networks.encoders import ConvEncoder, VectorEncoder
-from merl.networks.fusion import Concatenation, Fusion
+from merl.networks.fusion import SIMPLEX_GROUP, Concatenation, Fusion
 from merl.networks.heads import Actor, GaussianActor, HeadSize, TwinCritic
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
@@ -86,10 +86,11 @@ def make_networks(
         pad=config.shift_pad,
     )
     senses = {key: encoders.features[key] for key in (*images, *vectors)}
-    critic_fusion = _fusion(config, encoders.features, len(senses))
+    share = _share(config, tuple(senses))
+    critic_fusion = _fusion(config, encoders.features, share)
     actor_fusion = None
     if config.fusion == "decoupled":
-        actor_fusion = _fusion(config, senses, len(senses))
+        actor_fusion = _fusion(config, senses, share)
     size = HeadSize(config.head_layers, config.hidden_dim, config.head_norm)
     critic = TwinCritic(critic_fusion.latent_dim, action_dim, size)
     policy = actor((actor_fusion or critic_fusion).latent_dim, action_dim, size)
@@ -108,11 +109,12 @@ def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...]
     given = [k for k, s in space.items() if is_vector(s)]
     vectors = _keys("vectors", config.vectors, given, default=[k for k in given if k != "state"])
     if not images and not vectors:
-        hint = (
-            "name it with --agent.vectors state, or take --agent merl_state, ddpg or sac"
-            if "state" in given
-            else "an image is a uint8 box (H, W, C), a vector a float box (n,)"
-        )
+        if config.vectors == ():
+            hint = "it needs an image, a uint8 box (H, W, C), or take --agent proprio"
+        elif "state" in given:
+            hint = "name it with --agent.vectors state, or take --agent merl_state, ddpg or sac"
+        else:
+            hint = "an image is a uint8 box (H, W, C), a vector a float box (n,)"
         raise MerlError(f"the agent finds nothing to sense among {sorted(space)}: {hint}")
     return images, vectors
 
@@ -137,19 +139,31 @@ def told_to_critic(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
     return keys
 
 
-def _fusion(
-    config: AgentConfig, features: Mapping[str, int], senses: int
-) -> Fusion | Concatenation:
-    """For these modalities; each has the share of d that it has in the actor's fusion."""
-    if config.latent_dim == 0:
-        return Concatenation(features)
-    if config.latent_dim % senses:
+def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
+    """What each modality has of d; with an informed critic, what the actor's have.
+
+    Raises:
+        MerlError: d cannot be split so.
+    """
+    share, rest = divmod(config.latent_dim, len(senses))
+    if rest:
         raise MerlError(
-            f"agent.latent-dim {config.latent_dim} does not split evenly over {senses} modalities "
-            f"({', '.join(features)}): use a multiple of {senses}"
+            f"agent.latent-dim {config.latent_dim} does not split evenly over {len(senses)} "
+            f"modalities ({', '.join(senses)}): use a multiple of {len(senses)}"
         )
-    latent_dim = config.latent_dim // senses * len(features)
-    return Fusion(features, latent_dim, config.fusion_norm, config.squash)
+    if config.squash == "simplex" and share % SIMPLEX_GROUP:
+        raise MerlError(
+            f"agent.squash simplex needs a multiple of {SIMPLEX_GROUP} per modality, not {share}: "
+            f"use agent.latent-dim {SIMPLEX_GROUP * len(senses)} or a multiple"
+        )
+    return share
+
+
+def _fusion(config: AgentConfig, features: Mapping[str, int], share: int) -> Fusion | Concatenation:
+    """For these modalities, so many numbers each."""
+    if share == 0:
+        return Concatenation(features)
+    return Fusion(features, share, config.fusion_norm, config.squash)
 
 
 def _image_encoder(config: AgentConfig, space: spaces.Space[Any], stack: int) -> ConvEncoder:
@@ -175,7 +189,9 @@ def _keys(
         return tuple(given if default is None else default)
     for key in chosen:
         if key not in given:
+            there = f"gives {given}" if given else f"gives no {kind.split('-')[-1]}"
             raise MerlError(
-                f"agent.{kind} names {key!r}, but the environment gives {given or 'none such'}"
+                f"agent.{kind} names {key!r}, but the environment {there}: name what there is with "
+                f"--agent.{kind}, or have it give {key!r}"
             )
     return chosen

@@ -55,7 +55,7 @@ def resume(args: list[str]) -> int:
         start = Checkpoint.find(run.checkpoints)
         config = _resumed_config(run, start, options)
         evaluated = start.state()["progress"]["evaluated"]
-        if start.step == config.steps and evaluated == start.step:
+        if start.step >= config.steps and evaluated == start.step:
             steps = f"{start.step:,} of {config.steps:,} steps"
             print(f"{run.path} is done: {steps}; --steps N takes it further")
             return 0
@@ -67,7 +67,7 @@ def resume(args: list[str]) -> int:
 def _resumed_config(run: Run, start: Checkpoint, options: ResumeOptions) -> TrainConfig:
     """The run's config with what the user changes; on another machine what it decided is open."""
     steps = options.steps or run.config.steps
-    if start.step > steps:
+    if options.steps is not None and start.step > steps:
         raise MerlError(f"--steps {steps} is less than the {start.step:,} already taken")
     config = dataclasses.replace(run.config, minutes=options.minutes, steps=steps)
     if run.has_moved() or options.device not in (None, config.device):

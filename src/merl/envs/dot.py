@@ -1,9 +1,9 @@
 """A small task whose optimum is known: steer a dot to a mark, by camera and joints.
 
-Learnt in seconds, it tells whether an agent works, and what each sense is good for:
+Learnt in a minute or two, it tells whether an agent works, and what each sense is good for:
 
-    merl train merl.envs.dot:whole --preset smoke --steps 5000   the camera sees dot and mark
-    merl train merl.envs.dot:split ...   it sees the mark alone: where the dot is, the joints know
+    merl.envs.dot:whole   the camera sees dot and mark
+    merl.envs.dot:split   it sees the mark alone: where the dot is, the joints know
 """
 
 from __future__ import annotations

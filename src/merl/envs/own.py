@@ -7,13 +7,13 @@ import sys
 import warnings
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import registry
-from gymnasium.wrappers import RescaleAction
 from numpy.typing import NDArray
 
 from merl.core import MerlError, is_image, is_vector, meant
@@ -59,25 +59,28 @@ def adapt(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         MerlError: the actions are not a box of finite bounds, or nothing can be sensed.
     """
     actions = env.action_space
-    if not isinstance(actions, spaces.Box) or len(actions.shape) != 1:
+    if (
+        not isinstance(actions, spaces.Box)
+        or len(actions.shape) != 1
+        or not np.issubdtype(actions.dtype, np.floating)
+    ):
         raise MerlError(
-            f"the environment's actions are {actions}: an agent here gives a box of numbers (n,)"
+            f"the environment's actions are {actions}: an agent here gives a box of real numbers "
+            "(n,)"
         )
-    if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
+    if not np.isfinite([actions.low, actions.high]).all() or (actions.low > actions.high).any():
         raise MerlError(
             f"the environment's actions are {actions}: give them finite bounds, which are scaled "
             "to [-1, 1]"
         )
-    if actions.dtype != np.float32 or (actions.low != -1).any() or (actions.high != 1).any():
-        env = RescaleAction(env, np.float32(-1.0), np.float32(1.0))
     return Adapted(env)
 
 
 class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Observations as a `Dict` of images uint8 (H, W, C) and vectors float32 (n,).
+    """Observations as a `Dict` of images and vectors, actions in [-1, 1].
 
     Args:
-        env: whose observations are a box, or a `Dict` of boxes.
+        env: whose observations are a box, or a `Dict` of boxes, and whose actions are a finite box.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -103,7 +106,11 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
             )
         self._spaces = taken
         self.observation_space = spaces.Dict(taken)
-        self.action_space = spaces.Box(-1.0, 1.0, env.action_space.shape, np.float32)
+        actions = env.action_space
+        assert isinstance(actions, spaces.Box)
+        self._low, self._high = actions.low.astype(np.float64), actions.high.astype(np.float64)
+        self._dtype = actions.dtype
+        self.action_space = spaces.Box(-1.0, 1.0, actions.shape, np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -114,21 +121,39 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], Any, bool, bool, Any]:
         """Take an action in [-1, 1]; see `gymnasium.Env.step`."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self.env.step(self._scaled(action))
         if "is_success" in info and "success" not in info:
             info = {**info, "success": info["is_success"]}
-        return self._adapted(observation), float(reward), terminated, truncated, info
+        over = bool(terminated), bool(truncated)
+        return self._adapted(observation), float(reward), *over, info
+
+    def _scaled(self, action: NDArray[np.float32]) -> NDArray[Any]:
+        """From [-1, 1] to the environment's own bounds, never beyond them."""
+        share = (np.asarray(action, np.float64) + 1.0) / 2.0
+        wanted = self._low + share * (self._high - self._low)
+        return wanted.clip(self._low, self._high).astype(self._dtype)
 
     def _adapted(self, observation: Any) -> dict[str, Any]:
         whole = observation if self._plain is None else {self._plain: observation}
-        return {key: _part(space, whole[key]) for key, space in self._spaces.items()}
+        adapted = {}
+        for key, space in self._spaces.items():
+            if key not in whole:
+                raise MerlError(f"the environment's observation lacks {key!r}, which its space has")
+            adapted[key] = _part(key, space, whole[key])
+        return adapted
 
 
-def _part(space: spaces.Space[Any], value: Any) -> NDArray[Any]:
+def _part(key: str, space: spaces.Space[Any], value: Any) -> NDArray[Any]:
     """One modality as its space has it."""
     array = np.asarray(value)
-    if is_image(space) and array.shape != space.shape:
-        array = array[..., None] if array.ndim == 2 else np.moveaxis(array, 0, -1)
+    if is_image(space):
+        if array.dtype != np.uint8:
+            raise MerlError(
+                f"observation {key!r} is of {array.dtype}, but its space says uint8: give pixels "
+                "from 0 to 255"
+            )
+        if array.shape != space.shape:
+            array = array[..., None] if array.ndim == 2 else np.moveaxis(array, 0, -1)
     return array.astype(space.dtype, copy=False)
 
 
@@ -154,6 +179,10 @@ def _taken(space: spaces.Space[Any]) -> spaces.Box | None:
 
 def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
     module, colon, name = task.partition(":")
+    env_id = name if colon else task
+    if env_id in ENV_IDS.values():
+        known = next(task for task, known in ENV_IDS.items() if known == env_id)
+        raise MerlError(f"task {task!r} is merl's own: call it {known}")
     if not colon:
         if task not in registry:
             way = meant(task, [*ENV_IDS, *registry])
@@ -161,13 +190,7 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
                 way = f"choose from {', '.join(ENV_IDS)}, or name a Gymnasium id or module:function"
             raise MerlError(f"task {task!r} is unknown: {way}")
         return _by_id(task, render_mode)
-    here = str(Path.cwd())  # where `python` would look, and the command line does not
-    if here not in sys.path:
-        sys.path.append(here)
-    try:
-        found = import_module(module)
-    except ImportError as error:
-        raise MerlError(f"task {task!r}: module {module!r} cannot be imported: {error}") from None
+    found = _imported(task, module)
     make = getattr(found, name, None)
     if make is None:
         if name in registry:
@@ -176,13 +199,43 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
             f"task {task!r}: module {module!r} has no function {name!r}, and registers no "
             "environment of that name"
         )
-    if not callable(make):
-        raise MerlError(f"task {task!r}: {name!r} is no function that makes an environment")
-    knows = "render_mode" in inspect.signature(make).parameters
-    env = make(render_mode=render_mode) if knows else make()
+    env = _called(task, make, render_mode)
     if not isinstance(env, gymnasium.Env):
-        raise MerlError(f"task {task!r}: {name!r} gave {type(env).__name__}, not a gymnasium.Env")
+        raise MerlError(f"task {task!r} gave {type(env).__name__}, not a gymnasium.Env")
     return env
+
+
+def _imported(task: str, module: str) -> ModuleType:
+    """The module, from the folder where we are before any other, as `python` would."""
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise MerlError(f"task {task!r}: write it as my_robot:make_env, for my_robot.py here")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise MerlError(
+            f"task {task!r}: {error}: call merl where it lies, or name its folder in PYTHONPATH"
+        ) from None
+    except Exception as error:
+        raise MerlError(
+            f"task {task!r}: importing {module!r} failed: {type(error).__name__}: {_line(error)}"
+        ) from error
+
+
+def _called(task: str, make: Any, render_mode: str | None) -> Any:
+    """What the function gives, told how to render if it knows that."""
+    try:
+        signature = inspect.signature(make)
+        given = {"render_mode": render_mode} if "render_mode" in signature.parameters else {}
+        signature.bind(**given)
+    except (TypeError, ValueError) as error:
+        raise MerlError(
+            f"task {task!r}: a function is needed that makes an environment and takes no "
+            f"arguments, or render_mode alone ({_line(error)})"
+        ) from None
+    return make(**given)
 
 
 def _renders(env: gymnasium.Env[Any, Any]) -> bool:
@@ -191,19 +244,30 @@ def _renders(env: gymnasium.Env[Any, Any]) -> bool:
         return False
     try:
         env.reset(seed=0)
-        return env.render() is not None
-    except (gymnasium.error.Error, ImportError) as error:
-        warnings.warn(f"the environment cannot be filmed: {error}", stacklevel=2)
+        picture: Any = env.render()
+    except Exception as error:  # whatever a display or a driver may raise
+        warnings.warn(f"the environment cannot be filmed: {_line(error)}", stacklevel=2)
         return False
+    usable = isinstance(picture, np.ndarray) and picture.dtype == np.uint8
+    if not usable or picture.ndim != 3 or picture.shape[2] != 3:
+        warnings.warn(
+            "the environment cannot be filmed: it does not render uint8 (H, W, 3)", stacklevel=2
+        )
+        return False
+    return True
 
 
 def _by_id(env_id: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
+    if render_mode is not None:
+        try:
+            return gymnasium.make(env_id, render_mode=render_mode)
+        except Exception:  # it may not know this way to render
+            return _by_id(env_id, None)
     try:
-        if render_mode is not None:
-            try:
-                return gymnasium.make(env_id, render_mode=render_mode)
-            except (TypeError, gymnasium.error.Error):  # it cannot render so
-                pass
         return gymnasium.make(env_id)
-    except (gymnasium.error.Error, ImportError) as error:
-        raise MerlError(f"task {env_id!r} cannot be made: {error}") from None
+    except (gymnasium.error.Error, ImportError, TypeError) as error:
+        raise MerlError(f"task {env_id!r} cannot be made: {_line(error)}") from None
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -164,8 +164,11 @@ def compose(
         chosen.config, task=task, preset=preset, agent_name=name, setting=setting
     )
     values = dict(chosen.agent)
-    if preset == "paper":
-        values["head_layers"] = HEAD_LAYERS.get(task, 3)
+    base = AGENTS[name]
+    if preset == "paper" and base.head_norm:
+        values["head_layers"] = HEAD_LAYERS.get(task, base.head_layers)
+    if base.noise_std_end is not None:  # all of it within the run
+        values["noise_steps"] = min(base.noise_steps, config.steps // 2)
     if setting == "published":
         if name not in PUBLISHED:
             raise MerlError(
@@ -176,4 +179,4 @@ def compose(
         replay = dataclasses.replace(config.replay, **theirs.replay)
         config = dataclasses.replace(config, replay=replay, **theirs.run)
         values = dict(theirs.agent)
-    return dataclasses.replace(config, agent=dataclasses.replace(AGENTS[name], **values))
+    return dataclasses.replace(config, agent=dataclasses.replace(base, **values))

@@ -8,7 +8,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from merl.core import MerlError
 from merl.networks.names import module_name
 
 Squash = Literal["tanh", "simplex"]
@@ -20,36 +19,25 @@ class Fusion(nn.Module):
 
     Args:
         features: the length of each modality's encoding, by key, in the order of concatenation.
-        latent_dim: d, the length of the whole; split evenly over the modalities.
+        share: what each modality has of the whole, numbers; with simplex a multiple of eight.
         layer_norm: whether to normalise (the paper's Figure 3c switches it off).
         squash: "tanh", or "simplex" for a softmax over groups of eight.
 
     Attributes:
-        latent_dim: d.
+        latent_dim: d, the length of the whole.
         modalities: the keys.
     """
 
     def __init__(
         self,
         features: Mapping[str, int],
-        latent_dim: int,
+        share: int,
         layer_norm: bool = True,
         squash: Squash = "tanh",
     ) -> None:
         super().__init__()
-        share = latent_dim // len(features)
-        if share * len(features) != latent_dim:
-            raise MerlError(
-                f"agent.latent-dim {latent_dim} does not split evenly over {len(features)} "
-                f"modalities ({', '.join(features)}): use a multiple of {len(features)}"
-            )
-        if squash == "simplex" and share % SIMPLEX_GROUP:
-            raise MerlError(
-                f"agent.squash simplex needs a multiple of {SIMPLEX_GROUP} per modality, "
-                f"not {share}: use agent.latent-dim {SIMPLEX_GROUP * len(features)} or a multiple"
-            )
         self.squash = squash
-        self.latent_dim = latent_dim
+        self.latent_dim = share * len(features)
         self.modalities = tuple(features)
         self.projections = nn.ModuleDict(
             {module_name(key): nn.Linear(n, share) for key, n in features.items()}

@@ -90,6 +90,12 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_choice("agent", self.agent_name, tuple(AGENTS))
+        kind = type(AGENTS[self.agent_name])
+        if type(self.agent) is not kind:
+            raise MerlError(
+                f"agent {self.agent_name!r} is made from a {kind.__name__}, not from a "
+                f"{type(self.agent).__name__}"
+            )
         for name in ("steps", "keep", "action_repeat"):
             if not 1 <= getattr(self, name) <= MOST_STEPS:
                 raise MerlError(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from typing import Any
 
 import gymnasium
+import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import FilterObservation
 
 from merl.agents.config import AgentConfig
 from merl.agents.networks import modalities, told_to_critic
+from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
 from merl.envs.config import OBSERVATIONS, EnvConfig
@@ -29,6 +32,12 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
     render_mode = changes.pop("render_mode", None)
     env: gymnasium.Env[Any, Any]
     if config.own_env:
+        changes.pop("render_size", None)
+        if changes:
+            raise MerlError(
+                f"{', '.join(changes)} is for merl's own tasks: {config.task} decides for itself "
+                "how it is seen"
+            )
         env = make_own(config.task, render_mode)
     else:
         seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))
@@ -52,6 +61,22 @@ def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[space
     images, vectors = modalities(config.agent, space)
     keys = (*images, *vectors, *told_to_critic(config.agent, space))
     return spaces.Dict({key: space[key] for key in keys}), env.action_space
+
+
+def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
+    """Where the environment's random numbers stand, as plain types; None if it does not tell.
+
+    Without it a run that is resumed meets other episodes than it would have met.
+    """
+    generator = getattr(env.unwrapped, "np_random", None)
+    if not isinstance(generator, np.random.Generator):
+        return None
+    state: dict[str, Any] = dict(generator.bit_generator.state)
+    try:
+        json.dumps(state)
+    except TypeError:
+        return None
+    return state
 
 
 def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:

@@ -85,7 +85,7 @@ class Policy:
     def make_env(self, **changes: Any) -> gymnasium.Env[Any, Any]:
         """The environment that the agent was trained in, with fields of `EnvConfig` changed."""
         renderer = changes.get("renderer", self.config.env.renderer)
-        if renderer != self.config.env.renderer:
+        if renderer != self.config.env.renderer and not self.config.own_env:
             warnings.warn(
                 f"the agent was trained with renderer {self.config.env.renderer!r} and sees "
                 f"{renderer!r} now: these pictures differ, and it may do worse",
@@ -140,8 +140,9 @@ class Evaluation:
                     f"{name}_low": interval.low,
                     f"{name}_high": interval.high,
                 }
-        for name in self.episodes[0].terms:
-            values[f"reward/{name}"] = float(np.mean([e.terms[name] for e in self.episodes]))
+        for name in dict.fromkeys(name for episode in self.episodes for name in episode.terms):
+            told = [episode.terms.get(name, 0.0) for episode in self.episodes]
+            values[f"reward/{name}"] = float(np.mean(told))
         return values
 
 

@@ -113,7 +113,7 @@ def train(
             else:
                 action = _first(agent.act(stack.observation(), explore=True))
             observation, reward, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
+            over = bool(terminated or truncated)
             discount = 0.0 if terminated else 1.0
             replay.add(Transition(action, float(reward), discount, observation, over))
             stack.push(observation)

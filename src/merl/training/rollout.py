@@ -30,13 +30,13 @@ class FrameStack:
     def reset(self, observation: Observation) -> None:
         """Begin an episode."""
         for key, frames in self._frames.items():
-            frames.extend([observation[key]] * (self._length - 1))
+            frames.extend([observation[key].copy()] * (self._length - 1))
         self.push(observation)
 
     def push(self, observation: Observation) -> None:
         """Take in what a step led to."""
         for key, frames in self._frames.items():
-            frames.append(observation[key])
+            frames.append(observation[key].copy())  # a camera may refill one and the same array
         self._vectors = {k: v for k, v in observation.items() if k not in self._frames}
 
     def observation(self) -> dict[str, torch.Tensor]:

@@ -43,7 +43,8 @@ class Timing:
 
     Attributes:
         update: of one update, for each way that was tried.
-        step: of acting and one environment step, picture included.
+        step: of acting and one step of the run's environment, picture included; where actions are
+            held, that is one decision.
         frame: of one picture of a video; 0 where none is made.
     """
 
@@ -63,12 +64,13 @@ class Timing:
     def seconds(self, config: TrainConfig, done: int = 0) -> float:
         """The time that a run will take from step `done` on, evaluation included."""
         steps = max(0, config.steps - done)
+        repeat = config.action_repeat
         updates = (config.steps - max(done, config.seed_steps)) * config.updates_per_step
         evaluations = max(1, steps // config.eval.every) * config.eval.episodes
-        length = 250  # steps of an episode, near enough for an estimate
+        length = 250 / repeat  # decisions of an episode, near enough for an estimate
         videos = {"each": steps // config.eval.every or 1, "last": 1, "none": 0}[config.eval.video]
         whole = max(0.0, updates) * self.update[self.best] + videos * length * self.frame
-        whole += (steps + evaluations * length) * self.step
+        whole += (steps / repeat + evaluations * length) * self.step
         return min(whole, (config.minutes or float("inf")) * 60)
 
 

@@ -25,7 +25,7 @@ from merl.resources import available_memory
 from merl.training import checkpoint
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
-from merl.training.environment import make_run_env, run_spaces
+from merl.training.environment import environment_state, make_run_env, run_spaces
 from merl.training.evaluation import Evaluation, Policy, evaluate
 from merl.training.loop import Moment, Progress, Randomness, train
 from merl.training.meters import Averages, Clock
@@ -222,6 +222,11 @@ class _Stretch:
         self.view.begin(self.run, trainer)
         if not trainer.films and self.config.eval.video != "none":
             self.view.warn("there will be no videos: the environment does not render to an array")
+        if environment_state(trainer.env) is None:
+            self.view.warn(
+                "a resumed run will meet other episodes than this one would: the environment does "
+                "not draw from Gymnasium's np_random"
+            )
         self.clock.mark(progress)
         for moment in train(
             trainer.env,
@@ -250,7 +255,8 @@ class _Stretch:
         trainer.progress = Progress(**state["progress"])
         trainer.randomness.load_state_dict(state["randomness"])
         self.replay.load_state_dict(state["replay"])
-        trainer.env.unwrapped.np_random.bit_generator.state = state["environment"]
+        if state["environment"] is not None:
+            trainer.env.unwrapped.np_random.bit_generator.state = state["environment"]
         self.clock = Clock(state["seconds"], state["cpu_seconds"])
         self.metrics.trim(trainer.progress.step)
 
@@ -316,7 +322,7 @@ class _Stretch:
             "progress": dataclasses.asdict(progress),
             "randomness": trainer.randomness.state_dict(),
             "replay": self.replay.state_dict(),
-            "environment": trainer.env.unwrapped.np_random.bit_generator.state,
+            "environment": environment_state(trainer.env),
             "seconds": self.clock.seconds(),
             "cpu_seconds": self.clock.cpu_seconds(),
             "env": to_plain(self.config.env),

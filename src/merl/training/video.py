@@ -99,8 +99,9 @@ class VideoWriter:
                 so that the columns stay where they are.
 
         Raises:
-            MerlError: the file cannot be written; what there was of it is removed.
-            ValueError: a picture of another kind, or a writer that is closed.
+            MerlError: the file cannot be written, or a picture is of another kind; what there was
+                of it is removed.
+            ValueError: the writer is closed.
         """
         if self._container is None:
             raise ValueError(f"{self._path} is closed")
@@ -152,7 +153,7 @@ class VideoWriter:
 
     def _check(self, frame: NDArray[np.uint8]) -> None:
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
-            raise ValueError(f"a picture is uint8 (H, W, 3), not {frame.dtype} {frame.shape}")
+            raise MerlError(f"a picture is uint8 (H, W, 3), not {frame.dtype} {frame.shape}")
         if self._shape is None:
             self._shape = frame.shape
             times = math.ceil(MIN_SIDE / min(frame.shape[:2]))
@@ -160,7 +161,7 @@ class VideoWriter:
                 times += times % 2  # an even size
                 self._size = (times * frame.shape[1], times * frame.shape[0])
         if frame.shape != self._shape:
-            raise ValueError(f"a picture {frame.shape} after pictures {self._shape}")
+            raise MerlError(f"a picture {frame.shape} after pictures {self._shape}")
 
     def _open_stream(self, container: OutputContainer, frame: NDArray[np.uint8]) -> VideoStream:
         options = {"crf": "20", "preset": "veryfast"}

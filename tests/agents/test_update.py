@@ -195,6 +195,7 @@ def test_bf16(case: Case) -> None:
     for name, truth in (("critic_loss", report.critic_loss), ("actor_loss", report.actor_loss)):
         assert (metrics[name] - truth).abs() < 0.01 * (1 + truth.abs())
     found = gradients_of(agent)
+    assert found.keys() == report.gradients.keys()
     for symbol in (*reference.CRITIC_LEARNS, *reference.ACTOR_LEARNS):
         names = reference.of(found, [symbol])  # none for the identity's zeta
         if names:

@@ -15,18 +15,19 @@ import torch
 
 from merl.agents import make_agent
 from merl.envs import make_env
-from merl.experiments.presets import PRESETS
+from merl.experiments.presets import compose
 from merl.training.timing import random_batch
 
 REPEATS = 30
+J: dict[str, Any] = {"conv_strides": (3, 2, 1, 1), "hidden_dim": 256}
 SETTINGS: dict[str, dict[str, Any]] = {
     "preset laptop": {},
-    "width 512": {"hidden_dim": 512},
-    "strides 2, 2, 1, 1": {"conv_strides": (2, 2, 1, 1)},
-    "strides 2, 2, 1, 1 and width 512": {"conv_strides": (2, 2, 1, 1), "hidden_dim": 512},
-    "strides 2, 2, 2, 1": {"conv_strides": (2, 2, 2, 1)},
-    "16 channels": {"conv_channels": 16},
-    "batch 64": {"batch_size": 64},
+    "width 256": {"hidden_dim": 256},
+    "strides 3, 2, 1, 1": {"conv_strides": (3, 2, 1, 1)},
+    "setting J": {**J},
+    "J, strides 2, 2, 2, 1": {**J, "conv_strides": (2, 2, 2, 1)},
+    "J, 16 channels": {**J, "conv_channels": 16},
+    "J, batch 64": {**J, "batch_size": 64},
 }
 
 
@@ -39,7 +40,7 @@ def main() -> None:
     assert isinstance(actions, gymnasium.spaces.Box)
     prepared = {}
     for name, changes in SETTINGS.items():
-        config = dataclasses.replace(PRESETS["laptop"], task="reach_duplo")
+        config = compose("laptop", "reach_duplo")
         size = {"batch_size": changes["batch_size"]} if "batch_size" in changes else {}
         replay = dataclasses.replace(config.replay, **size)
         others = {key: value for key, value in changes.items() if key != "batch_size"}

@@ -44,20 +44,18 @@ PRESETS: dict[str, Preset] = {
         "made for 2 cores without a GPU: learns in about an hour",  # docs/laptop.md
         TrainConfig(
             _TASK,
-            steps=200_000,
-            # An hour of updates is short and random steps are cheap: begin with some that met a
-            # reward.
-            random_steps=10_000,
-            seed_steps=10_000,
+            steps=150_000,
+            random_steps=1000,
+            seed_steps=2000,
             env=EnvConfig(renderer="warp", image_size=48),
             replay=ReplayConfig(batch_size=128),
             eval=EvaluationConfig(every=10_000, episodes=10, video="last"),
         ),
         {
             "learning_rate": 3e-4,
-            "conv_strides": (3, 2, 1, 1),
+            "conv_strides": (2, 2, 1, 1),
             "shift_pad": 2,
-            "hidden_dim": 256,
+            "hidden_dim": 512,
         },
     ),
     "state": Preset(

@@ -279,7 +279,7 @@ BAD = {
     "train reach_duplo --agent.latent-dim 127": "does not split evenly",
     "train reach_duplo --observations state": "--agent.vectors state",
     "train reach_duplo --updates-per-step inf": "updates-per-step must be at least 0, not inf",
-    "train reach_duplo --agent.vectors joints": "the environment gives ['proprio']",
+    "train reach_duplo --agent.vectors joints": "the environment gives ['proprio', 'state']",
     "train reach_duplo --image-size 8": "16",
     "train reach_duplo --renderer wrap": "'gl', 'warp'",
     "train reach_duplo --minutes 0": "minutes must be above 0",

@@ -158,9 +158,7 @@ def compose(
     name = agent or chosen.agent_name
     check_choice("agent", name, tuple(AGENTS))
     check_choice("setting", setting, get_args(Setting))
-    config = dataclasses.replace(
-        chosen.config, task=task, preset=preset, agent_name=name, setting=setting
-    )
+    config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
     values = dict(chosen.agent)
     base = AGENTS[name]
     if preset == "paper" and base.head_norm:
@@ -177,4 +175,5 @@ def compose(
         replay = dataclasses.replace(config.replay, **theirs.replay)
         config = dataclasses.replace(config, replay=replay, **theirs.run)
         values = dict(theirs.agent)
-    return dataclasses.replace(config, agent=dataclasses.replace(base, **values))
+    made = dataclasses.replace(base, **values)
+    return dataclasses.replace(config, agent_name=name, agent=made)

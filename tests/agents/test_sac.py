@@ -100,7 +100,7 @@ def test_the_density_is_that_of_a_squashed_gaussian() -> None:
         draw = torch.zeros(1, 6, dtype=torch.float64)
         draw[0, 0] = noise
         action, log_prob, _ = agent._sample(encoded, draw)
-        first.append(float(action[0, 0]))
+        first.append(action[0, 0].item())
         log_probs.append(float(log_prob))
     rest = agent._sample(encoded, torch.zeros(1, 6, dtype=torch.float64))[1]
     # log pi of the first action alone, up to the constant of the five that stand still

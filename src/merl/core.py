@@ -34,8 +34,16 @@ class MerlError(Exception):
     """A fault that the user can mend.
 
     Its text is one line that names the thing, the value, and the way out; the command line prints
-    it without a traceback and exits with code 2.
+    it without a traceback and exits with `exit_code`.
     """
+
+    exit_code = 2
+
+
+class NotFinite(MerlError):  # noqa: N818 (a state of affairs, as in `isfinite`)
+    """A NaN or an infinity where there must be a number: the run stops before it spreads."""
+
+    exit_code = 3
 
 
 def meant(name: str, known: Iterable[str]) -> str:

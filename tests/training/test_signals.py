@@ -4,13 +4,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
 from merl.training.signals import Interrupt
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
 def test_a_signal_is_a_wish_and_the_former_handler_comes_back(number: int) -> None:
     former = signal.getsignal(number)
     with Interrupt().listening() as interrupt:
@@ -22,9 +23,17 @@ def test_a_signal_is_a_wish_and_the_former_handler_comes_back(number: int) -> No
 
 def test_a_second_hangup_lets_it_save() -> None:
     with Interrupt().listening() as interrupt:
-        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGTERM):
-            os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGHUP)
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGHUP)
         assert interrupt.number == signal.SIGHUP
+
+
+def test_the_same_signal_to_process_and_group_is_one() -> None:
+    with Interrupt().listening() as interrupt:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert interrupt.number == signal.SIGTERM
 
 
 def test_what_is_ignored_stays_ignored() -> None:
@@ -37,13 +46,14 @@ def test_what_is_ignored_stays_ignored() -> None:
         signal.signal(signal.SIGHUP, former)
 
 
-def test_a_second_interrupt_ends_at_once() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
+def test_a_second_signal_ends_at_once(number: int) -> None:
     program = (
-        "import os, signal; from merl.training.signals import Interrupt\n"
+        "import os, time; from merl.training.signals import Interrupt\n"
         "with Interrupt().listening():\n"
-        "    for _ in range(2): os.kill(os.getpid(), signal.SIGINT)\n"
+        f"    for _ in range(2): os.kill(os.getpid(), {int(number)}); time.sleep(0.2)\n"
         "    print('never')"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
-    assert done.returncode == 130
+    assert done.returncode == 128 + number
     assert done.stdout == b""

@@ -1,7 +1,8 @@
 """The command line.
 
-Exit codes: 0 done; 2 bad input, told in one line; 129, 130 and 143 stopped by SIGHUP, Ctrl-C or
-SIGTERM, with a run that had begun saved and ready to go on; 141 nobody reads what is written.
+Exit codes (docs/running.md): 0 done; 2 bad input, told in one line; 3 a NaN or an infinity stopped
+the run; 129, 130, 138 and 143 stopped by SIGHUP, Ctrl-C, SIGUSR1 or SIGTERM, with a run that had
+begun saved and ready to go on; 141 nobody reads what is written.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from merl.core import MerlError, meant
 # The modules are imported when called: a misspelt command should not wait for torch.
 COMMANDS = {
     "train": ("merl.cli.train", "train", "train an agent"),
-    "resume": ("merl.cli.train", "resume", "go on with a run"),
+    "resume": ("merl.cli.resume", "resume", "go on with a run"),
     "evaluate": ("merl.cli.evaluate", "evaluate", "run a trained policy, film it"),
     "tasks": ("merl.cli.tasks", "tasks", "what there is to learn"),
     "info": ("merl.cli.info", "info", "what this machine offers"),
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     except MerlError as error:
         print(f"merl: error: {error}", file=sys.stderr)
-        return 2
+        return error.exit_code
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # the reader has gone, e.g. `merl ... --help | head`

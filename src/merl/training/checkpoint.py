@@ -28,6 +28,7 @@ from safetensors.torch import save as to_bytes
 from torch import nn
 
 from merl.core import Agent, MerlError
+from merl.training.guards import check_weights
 
 FORMAT = 1
 _WEIGHTS, _LEARNER, _STATE, _MANIFEST = (
@@ -132,13 +133,16 @@ def save(
 
     Raises:
         OSError: it could not be written; the former ones are untouched.
+        NotFinite: a weight is a NaN or an infinity; so are they then.
     """
+    learnt = agent.state_dict()
+    check_weights({group: learnt[group] for group in _WEIGHT_GROUPS})
     root.mkdir(parents=True, exist_ok=True)
     part = root / f".part-{step:08d}"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
-        _write(part, agent.state_dict(), state)
+        _write(part, learnt, state)
         names = (_WEIGHTS, _LEARNER, _STATE)
         manifest = {
             "format": FORMAT,

@@ -19,6 +19,7 @@ from torch import Tensor
 from merl.core import Agent, Transition
 from merl.replay import Replay
 from merl.training.config import TrainConfig
+from merl.training.guards import check_moment
 from merl.training.rollout import Episode, FrameStack
 
 
@@ -97,12 +98,16 @@ def train(
         progress: moved on as the run goes.
         randomness: the run's random streams.
         config: steps, seed steps, random steps, updates per step, batch size.
+
+    Raises:
+        NotFinite: an observation or a reward is no number; the replay does not take it in.
     """
     shape = env.action_space.shape
     assert shape is not None
     while progress.step < config.steps:
         seed = randomness.environment if progress.episodes == 0 else None
         observation, _ = env.reset(seed=seed)
+        check_moment(observation, 0.0, progress.step)
         replay.begin(observation)
         stack.reset(observation)
         episode, over = Episode(), False
@@ -113,6 +118,7 @@ def train(
             else:
                 action = _first(agent.act(stack.observation(), explore=True))
             observation, reward, terminated, truncated, info = env.step(action)
+            check_moment(observation, float(reward), progress.step + config.action_repeat)
             over = bool(terminated or truncated)
             discount = 0.0 if terminated else 1.0
             replay.add(Transition(action, float(reward), discount, observation, over))

@@ -5,28 +5,33 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
 SHOW_CURSOR = "\x1b[?25h"
-_HEARD = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_HEARD = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
+_APART = 0.1
+"""Seconds from which on a second signal is one of its own: `timeout` and batch systems may send the
+same one twice, to the process and to its group."""
 
 
 @dataclass
 class Interrupt:
-    """A wish to stop, by a signal; a second Ctrl-C stops at once.
+    """A wish to stop, by a signal; a second one stops at once.
 
     Attributes:
         number: of the signal; None as long as there was none.
     """
 
     number: int | None = None
+    _at: float = 0.0
 
     @contextmanager
     def listening(self) -> Iterator[Interrupt]:
-        """Take SIGINT, SIGTERM and SIGHUP as a wish to stop at the next safe point.
+        """Take SIGINT, SIGTERM, SIGUSR1 and SIGHUP as a wish to stop at the next safe point.
 
         What the process was told to ignore, as `nohup` does, it goes on ignoring.
         """
@@ -39,11 +44,10 @@ class Interrupt:
                 signal.signal(number, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        # A closed terminal sends SIGHUP twice, and saving takes a moment: only a person's second
-        # Ctrl-C means at once.
-        if self.number is not None and number == signal.SIGINT:
+        if self.number is None:
+            self.number, self._at = number, time.monotonic()
+        # A closed terminal sends SIGHUP twice, and saving takes a moment.
+        elif number != signal.SIGHUP and time.monotonic() - self._at > _APART:
             if sys.stdout.isatty():  # the live view hides it
                 os.write(sys.stdout.fileno(), SHOW_CURSOR.encode())
             os._exit(128 + number)
-        if self.number is None:
-            self.number = number

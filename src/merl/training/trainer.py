@@ -27,6 +27,7 @@ from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
 from merl.training.environment import environment_state, make_run_env, run_spaces
 from merl.training.evaluation import Evaluation, Policy, evaluate
+from merl.training.guards import LossGuard
 from merl.training.loop import Moment, Progress, Randomness, train
 from merl.training.meters import Averages, Clock
 from merl.training.metrics import MetricsWriter
@@ -210,7 +211,7 @@ class _Stretch:
     ) -> None:
         self.trainer, self.config, self.run = trainer, trainer.config, run
         self.replay, self.metrics, self.view, self.interrupt = replay, metrics, view, interrupt
-        self.clock, self.averages = Clock(), Averages()
+        self.clock, self.averages, self.guard = Clock(), Averages(), LossGuard()
         self.evaluation: Evaluation | None = None
         self._saved = time.perf_counter()
 
@@ -237,6 +238,7 @@ class _Stretch:
             trainer.randomness,
             self.config,
         ):
+            self.guard.watch(moment.learning, moment.step)
             self.averages.add(moment.learning)
             self.view.moment(moment, self._log(moment) if moment.episode else {})
             if moment.episode and not self._is_to_stop():
@@ -278,6 +280,7 @@ class _Stretch:
     def _log(self, moment: Moment) -> dict[str, float]:
         """A row of metrics for the episode that has ended."""
         assert moment.episode is not None
+        self.guard.check()
         values = {f"train/{k}": v for k, v in moment.episode.metrics().items()}
         values |= self.averages.take()
         values |= self.clock.rates(self.trainer.progress)
@@ -315,7 +318,12 @@ class _Stretch:
         self.view.evaluating(episode, self.config.eval.episodes)
 
     def _save(self) -> bool:
-        """Write a checkpoint; that it could not be written is told, and does not stop the run."""
+        """Write a checkpoint; that it could not be written is told, and does not stop the run.
+
+        Raises:
+            NotFinite: what would be saved is no longer finite.
+        """
+        self.guard.check()
         trainer, progress = self.trainer, self.trainer.progress
         fresh = self.evaluation is not None and progress.evaluated == progress.step
         state = {

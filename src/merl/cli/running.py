@@ -1,0 +1,128 @@
+"""A run from the command line: what is told before it, and after it."""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import ExitStack
+from datetime import timedelta
+
+from rich.console import Console
+from rich.filesize import decimal
+
+from merl.cli.parsing import program
+from merl.cli.summary import summarize
+from merl.core import MerlError, is_image
+from merl.replay import replay_bytes
+from merl.training.checkpoint import Checkpoint
+from merl.training.config import TrainConfig
+from merl.training.console import ConsoleView
+from merl.training.resuming import taken_up
+from merl.training.run import Run
+from merl.training.trainer import Trainer
+
+
+def begin(config: TrainConfig, what: str) -> int:
+    """Train a new run to its end; returns the exit code.
+
+    Args:
+        config: of the run.
+        what: it is, for the first line.
+    """
+    return _train(config, what)
+
+
+def go_on(run: Run, asked: TrainConfig) -> int:
+    """Train a run from its last whole checkpoint to its end; returns the exit code.
+
+    Args:
+        run: which.
+        asked: the config with which it is to go on.
+
+    Raises:
+        MerlError: that would be another run, another process trains it, or it has nothing to go on
+            from.
+    """
+    config, changes = taken_up(run.config, asked)
+    if run.has_moved() or config.device != run.config.device:
+        # What was decided for another machine or device is open again.
+        agent = dataclasses.replace(config.agent, precision="auto")
+        config = dataclasses.replace(config, threads=None, agent=agent)
+    with run.lock():
+        start = Checkpoint.find(run.checkpoints)
+        state = start.state()
+        if config.steps < min(start.step, run.config.steps):
+            raise MerlError(f"--steps {config.steps} is less than the {start.step:,} already taken")
+        if start.step >= config.steps and state["progress"]["evaluated"] == start.step:
+            steps = f"{start.step:,} of {config.steps:,} steps"
+            print(f"{run.path} is done: {steps}; --steps N takes it further")
+            return 0
+        if not run.replay.is_dir():
+            raise MerlError(f"{run.replay} is gone, and without its replay a run cannot go on")
+        what = f"run {run.path} goes on at step {start.step:,}"
+        if state["replay"]["open"]:
+            what += " (it was stopped in an episode, and begins a new one)"
+        if changes:
+            what += f" with {', '.join(changes)}"
+        return _train(config, what, (run, start))
+
+
+def _train(config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint] | None = None) -> int:
+    console = Console()
+    with ExitStack() as stack:
+        try:
+            with console.status("building the scene and timing this machine"):
+                trainer = stack.enter_context(Trainer.prepare(config, new=resumed is None))
+        except KeyboardInterrupt:
+            console.print("stopped before training began: nothing was written")
+            raise
+        done = resumed[1].step if resumed else 0
+        console.print(_outlook(trainer, what, done), highlight=False)
+        with ConsoleView(console) as view:
+            outcome = trainer.resume(*resumed, view) if resumed else trainer.start(view)
+    folder = outcome.run.path
+    if outcome.signal is not None:
+        stopped = f"stopped at step {outcome.progress.step:,}"
+        how = (
+            "and saved: go on" if outcome.saved else "and not saved: go on from the last checkpoint"
+        )
+        console.print(f"{stopped} {how} with")
+        console.print(f"    {program()} resume {folder}", highlight=False, soft_wrap=True)
+        return 128 + outcome.signal
+    try:
+        summarize(outcome, console)
+    except KeyboardInterrupt:
+        console.print(f"{folder} is trained and saved", highlight=False, soft_wrap=True)
+        raise
+    return 0
+
+
+def _outlook(trainer: Trainer, what: str, done: int) -> str:
+    """What is going to happen, and how long it will take on this machine."""
+    config, timing = trainer.config, trainer.timing
+    seconds = timing.seconds(config, done)
+    size = replay_bytes(config.replay, trainer.space, trainer.action_space, config.capacity)
+    tried = ", ".join(f"{1000 * s:.0f} ms in {how}" for how, s in timing.update.items())
+    seen = not config.own_env and any(is_image(space) for space in trainer.space.values())
+    pictures = f" ({config.env.renderer} pictures)" if seen else ""
+    lines = [
+        f"{what}: {_amount(config, done)} of {config.task} on {config.device} take about "
+        f"{timedelta(seconds=round(seconds))}",
+    ]
+    if seconds > 86_400 and config.preset != "laptop":
+        lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
+    lines += [
+        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms a step{pictures}",
+        f"the replay takes {decimal(size)} for {config.capacity:,} steps",
+    ]
+    if (config.steps - config.seed_steps) * config.updates_per_step < 1:
+        lines.append(
+            f"nothing will be learnt: the first update comes after {config.seed_steps:,} steps, "
+            "with --updates-per-step above 0"
+        )
+    return "\n".join(lines)
+
+
+def _amount(config: TrainConfig, done: int) -> str:
+    """How much there is to do."""
+    steps = f"{config.steps - done:,} steps"
+    return steps if config.minutes is None else f"{config.minutes:g} minutes, or {steps},"

@@ -1,0 +1,89 @@
+"""Guards: what is no number is neither remembered, nor learnt from, nor saved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from merl.core import NotFinite, Observation
+
+_NEVER = torch.iinfo(torch.int64).max
+
+
+def check_moment(observation: Observation, reward: float, step: int) -> None:
+    """What an environment gave, before it enters the replay.
+
+    Args:
+        observation: images need no look, bytes are always numbers.
+        reward: what led there paid.
+        step: environment steps so far.
+
+    Raises:
+        NotFinite: naming the value and the step.
+    """
+    if not np.isfinite(reward):
+        raise NotFinite(f"the environment's reward is {reward} at step {step:,}")
+    for key, value in observation.items():
+        value = np.asarray(value)
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            index = np.flatnonzero(~np.isfinite(value))[0]
+            raise NotFinite(
+                f"the environment's observation {key!r} is {value.flat[index]} in place {index} "
+                f"at step {step:,}"
+            )
+
+
+def check_weights(groups: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """Weights, before they are saved.
+
+    Raises:
+        NotFinite: naming the tensor.
+    """
+    for group, tensors in groups.items():
+        for name, tensor in tensors.items():
+            if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+                raise NotFinite(f"the weights {group}.{name} are no longer finite")
+
+
+class LossGuard:
+    """Watches what the learner tells of its updates for a NaN or an infinity.
+
+    On the CPU it raises at once. On a GPU nothing waits for the card: the first bad step's number
+    stays there until `check` asks for it.
+    """
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._first: Tensor | None = None  # per name, the first bad step
+
+    def watch(self, metrics: Mapping[str, Tensor], step: int) -> None:
+        """Take in the metrics of an update at `step`; nothing, if there was none.
+
+        Raises:
+            NotFinite: on the CPU, naming the metric and the step.
+        """
+        if not metrics:
+            return
+        values = torch.stack([value.float() for value in metrics.values()])
+        bad = torch.where(values.isfinite(), _NEVER, step)
+        self._names = tuple(metrics)
+        self._first = bad if self._first is None else torch.minimum(self._first, bad)
+        if not values.is_cuda:
+            self.check()
+
+    def check(self) -> None:
+        """Look at what was watched.
+
+        Raises:
+            NotFinite: naming the metric that was bad first, and the step.
+        """
+        if self._first is None:
+            return
+        steps = self._first.tolist()
+        step = min(steps)
+        if step != _NEVER:
+            names = [name for name, first in zip(self._names, steps, strict=True) if first == step]
+            raise NotFinite(f"the learner's {', '.join(names)} is not finite at step {step:,}")

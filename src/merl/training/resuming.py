@@ -1,0 +1,88 @@
+"""What may change when a run goes on, and what makes it another run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from merl.core import MerlError
+from merl.training.config import TrainConfig
+
+HARMLESS = (
+    "steps",
+    "minutes",
+    "save_every",
+    "keep",
+    "device",
+    "threads",
+    "env.render_size",
+    "eval.every",
+    "eval.episodes",
+    "eval.video",
+    "agent.precision",
+)
+"""Fields that may change: they decide how long, how fast and how closely watched, not what."""
+_LEFT_OPEN = {"device": "auto", "threads": None, "agent.precision": "auto", "minutes": None}
+"""Values that ask for nothing: what the run has decided stays."""
+_NAMES = ("run_dir", "preset", "setting")
+"""Fields that only say where the others are from."""
+
+
+def taken_up(recorded: TrainConfig, asked: TrainConfig) -> tuple[TrainConfig, list[str]]:
+    """The config with which a run goes on.
+
+    Args:
+        recorded: what it was trained with so far.
+        asked: what it is to be trained with.
+
+    Returns:
+        The recorded config with the harmless changes, and these in words.
+
+    Raises:
+        MerlError: what is asked for would be another run; it names the fields.
+    """
+    before, after = dict(_flat(recorded)), dict(_flat(asked))
+    changed = {
+        name: (before.get(name), after.get(name))
+        for name in {**before, **after}
+        if before.get(name) != after.get(name)
+        and name not in _NAMES
+        and not (name in _LEFT_OPEN and after[name] == _LEFT_OPEN[name])
+    }
+    in_words = {
+        name: f"{name} {_told(old)} -> {_told(new)}" for name, (old, new) in changed.items()
+    }
+    refused = [words for name, words in in_words.items() if name not in HARMLESS]
+    if refused:
+        raise MerlError(
+            f"run {recorded.run_dir} cannot go on with {', '.join(refused)}: that is another run; "
+            "leave it as it was, or begin one with another --run-dir"
+        )
+    config = recorded
+    for name in changed:
+        config = _replaced(config, name, after[name])
+    # Minutes are those of a stretch: of the one that begins.
+    config = dataclasses.replace(config, minutes=asked.minutes)
+    return config, [words for name, words in in_words.items() if name != "minutes"]
+
+
+def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every field of a config and of the configs in it, by its dotted name."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _flat(value, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", value
+
+
+def _replaced(config: Any, name: str, value: Any) -> Any:
+    first, _, rest = name.partition(".")
+    if rest:
+        value = _replaced(getattr(config, first), rest, value)
+    return dataclasses.replace(config, **{first: value})
+
+
+def _told(value: Any) -> str:
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)

@@ -148,6 +148,19 @@ def signalled(tmp_path: Path, numbers: list[int]) -> None:
     assert (np.diff(steps) > 0).all()
 
 
+def test_a_folder_that_is_taken_away_is_not_made_anew(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = start(line(folder, "--steps", "100000"))
+    wait_until_saved(folder, process)
+    folder.rename(tmp_path / "elsewhere")
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "is gone" in err
+    assert "Traceback" not in err
+    assert not folder.exists()
+    assert main(["resume", str(tmp_path / "elsewhere"), "--steps", "1000"]) == 0
+
+
 def test_the_same_line_begins_goes_on_and_is_done(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import resource
+import tempfile
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -379,6 +380,66 @@ def test_going_back_anywhere(config, episodes, data):
 @given(configs, plans, st.data())
 def test_going_back_anywhere_long(config, episodes, data):
     go_back_anywhere(config, episodes, data)
+
+
+def go_back_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
+    """Save, write on, die at any moment, go back: all that was held at the save is held again."""
+    with tempfile.TemporaryDirectory() as folder:
+        replay = Replay(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
+        account = Account(settings)
+        state, saved, lost = replay.state_dict(), 0, 0
+        for episode, plan in enumerate(episodes):
+            for t in range(plan.length + 1):
+                write(replay, account, episode, t, plan)
+            move = data.draw(st.sampled_from(["go on", "save", "save and die", "die"]))
+            if move.startswith("save"):
+                replay.flush()
+                state, saved, lost = replay.state_dict(), len(account.moments), account.lost
+            if move == "save":
+                replay.settle()
+            elif move.endswith("die"):
+                replay = Replay(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
+                replay.load_state_dict(state)
+                del account.moments[saved:]
+                account.lost = lost
+            check(replay, account)
+
+
+@settings(max_examples=40, deadline=None)
+@given(configs, plans, st.data())
+def test_going_back_exactly(config, episodes, data):
+    go_back_exactly(config, episodes, data)
+
+
+@pytest.mark.long
+@settings(max_examples=600, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(configs, plans, st.data())
+def test_going_back_exactly_long(config, episodes, data):
+    go_back_exactly(config, episodes, data)
+
+
+def test_a_full_disk_costs_the_journal_and_no_more(tmp_path, caplog):
+    class Full:
+        def __init__(self, file):
+            self.file = file
+
+        def __getattr__(self, name):
+            return getattr(self.file, name)
+
+        def write(self, data):
+            return self.file.write(data[:7])
+
+    run = Run(tmp_path / "replay")
+    run.play(9, 9)
+    run.replay.flush()
+    state, moments = run.replay.state_dict(), len(run.account.moments)
+    run.replay.settle()
+    run.replay._journal._file = Full(run.replay._journal._file)
+    run.play(9, 2)
+    assert caplog.text.count("the disk is full") == 1
+    run.go_back(state, moments)  # to what the ring itself still holds
+    check(run.replay, run.account)
+    assert 0 < len(run.replay) < 18
 
 
 def test_what_came_after_a_state_does_not_come_back(tmp_path):

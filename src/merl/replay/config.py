@@ -91,8 +91,7 @@ def slots_for(capacity: int, frame_stack: int) -> int:
     """Moments that hold `capacity` steps of episodes of two hundred steps or more.
 
     An episode has one moment more than steps, and the oldest step needs its whole stack. Episodes
-    shorter than that fill the slots before the capacity is reached. What is to spare
-    also lets a run go back to its last checkpoint after the ring has wrapped.
+    that are shorter fill the slots before the capacity is reached.
     """
     return capacity + capacity // 200 + frame_stack
 

@@ -10,7 +10,8 @@ numbered 1, 2, 3, ... as they come; moment i lies in slot (i - 1) mod slots.
 
 A process that is killed loses nothing that was written. A machine that loses power loses what came
 after the last `flush`, and where that had begun to overwrite old moments, those may be torn. A
-checkpoint calls `flush` and keeps `state_dict`.
+checkpoint calls `flush`, keeps `state_dict`, and calls `settle` once it is on the disk: what is
+overwritten from then on goes into a journal, from which `load_state_dict` puts it back.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 
 from merl.core import Batch, MerlError, Observation, Transition
 from merl.replay.config import ReplayConfig, check_fits, slots_for
+from merl.replay.journal import Journal
 from merl.replay.storage import check_value, field_name, fields_of, open_files
 
 
@@ -84,6 +86,7 @@ class Replay:
         slots = slots_for(self.capacity, config.frame_stack)
         self._files: dict[str, mmap.mmap] = {}
         self._data: dict[str, NDArray[Any]]
+        self._journal: Journal | None = None
         if directory is None:
             self._data = {
                 name: np.zeros((slots, *field.shape), field.dtype) for name, field in fields.items()
@@ -94,12 +97,14 @@ class Replay:
                 name: np.frombuffer(self._files[name], field.dtype).reshape(-1, *field.shape)
                 for name, field in fields.items()
             }
+            self._journal = Journal(directory, self._data)
         self._keys = {key: field_name(key) for key in observation_space.spaces}
         self._slots = len(self._data["moment"])
         self._moments = self._steps = 0  # ever written
         self._first = 0  # the oldest step that can be sampled
         self._gap = 0  # the newest moment that went missing when the ring was opened again
         self._open = False  # an episode is in progress
+        self._settled = 0  # the newest moment of the last checkpoint
         # Step i led away from moment _sources[i mod capacity].
         self._sources = np.zeros(self.capacity, np.int64)
         self._take_over(moments=int(self._data["moment"].max()))
@@ -172,6 +177,12 @@ class Replay:
         for file in self._files.values():
             file.flush()
 
+    def settle(self) -> None:
+        """A checkpoint of the present state is on the disk: no older one is to be gone back to."""
+        self._settled = self._moments
+        if self._journal is not None:
+            self._journal.empty()
+
     def state_dict(self) -> dict[str, int | bool]:
         """The cursor and its counts as plain numbers; the moments stay where they are."""
         return {"moments": self._moments, "steps": self._steps, "open": self._open}
@@ -179,19 +190,24 @@ class Replay:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go back to what `state_dict` said; what was written since then is forgotten.
 
-        Of the moments held then, those overwritten since are gone: there are such only where the
-        ring has wrapped and its reserve (half a hundredth of the capacity) is used up.
+        What was overwritten since then is put back, if that was the last state to be settled; of
+        an older one, moments that a ring has overwritten which has wrapped are gone.
 
         Raises:
             MerlError: the ring does not hold what the state names.
         """
         moments = int(state["moments"])
-        if moments and self._data["moment"][self._slot(moments)] != moments:
+        journal = self._journal
+        there = moments == 0 or self._data["moment"][self._slot(moments)] == moments
+        if not there and (journal is None or not journal.holds(moments)):
             raise MerlError(
                 f"the replay does not hold moment {moments:,}, at which the checkpoint was taken: "
                 "it is not this run's, or was written to since; start a new run"
             )
+        if journal is not None:
+            journal.undo(moments)
         self._take_over(moments, int(state["steps"]), bool(state["open"]))
+        self._settled = moments
 
     def _slot(self, moment: int) -> int:
         """Where the ring holds a moment."""
@@ -214,6 +230,8 @@ class Replay:
             check_value(name, value, data[name])
         moment = self._moments + 1
         slot = self._slot(moment)
+        if self._journal is not None and 0 < data["moment"][slot] <= self._settled:
+            self._journal.keep(slot, by=moment)
         data["moment"][slot] = 0  # while it is written it is no moment, should the process die here
         for name, value in values.items():
             data[name][slot] = value

@@ -125,6 +125,18 @@ class Run:
         """Whether it was trained last on another machine than this one."""
         return _last_machine(_read(self.path)) != machine()
 
+    def check_there(self) -> None:
+        """Before anything is written, lest a folder that was taken away be made anew.
+
+        Raises:
+            MerlError: the folder is gone.
+        """
+        if not (self.path / CONFIG_FILE).exists():
+            raise MerlError(
+                f"run folder {self.path} is gone, removed or moved while the run was trained in "
+                "it: the run stops, and writes nothing in its place"
+            )
+
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Keep every other process from training in this folder; the lock dies with the process.

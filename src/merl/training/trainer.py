@@ -281,6 +281,7 @@ class _Stretch:
         """A row of metrics for the episode that has ended."""
         assert moment.episode is not None
         self.guard.check()
+        self.run.check_there()
         values = {f"train/{k}": v for k, v in moment.episode.metrics().items()}
         values |= self.averages.take()
         values |= self.clock.rates(self.trainer.progress)
@@ -305,6 +306,7 @@ class _Stretch:
             )
         except _Interrupted:
             return
+        self.run.check_there()
         trainer.progress.evaluated = step
         values = {f"eval/{name}": value for name, value in self.evaluation.metrics().items()}
         self.metrics.write(step, values | {"time/seconds": self.clock.seconds()})
@@ -321,9 +323,10 @@ class _Stretch:
         """Write a checkpoint; that it could not be written is told, and does not stop the run.
 
         Raises:
-            NotFinite: what would be saved is no longer finite.
+            MerlError: the run's folder is gone, or what would be saved is no longer finite.
         """
         self.guard.check()
+        self.run.check_there()
         trainer, progress = self.trainer, self.trainer.progress
         fresh = self.evaluation is not None and progress.evaluated == progress.step
         state = {
@@ -351,6 +354,7 @@ class _Stretch:
             return False
         finally:
             self._saved = time.perf_counter()
+        self.replay.settle()
         self.view.saved(progress.step)
         return True
 

@@ -1,0 +1,95 @@
+"""What a ring overwrote since the last checkpoint, so that a run can go back to it exactly.
+
+A ring that has wrapped writes over its oldest moments, which the last checkpoint still counted on.
+Each of these is appended to `overwritten.journal` before its slot is taken: the number of the
+moment that takes it, then the slot's fields. A checkpoint that is on the disk empties the file.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merl.core import MerlError
+
+_FILE = "overwritten.journal"
+_LOG = logging.getLogger(__name__)
+
+
+class Journal:
+    """The overwritten moments, in the order in which they were.
+
+    Args:
+        directory: the ring's.
+        data: the ring's arrays, (slots, *shape) each.
+
+    Raises:
+        MerlError: the file cannot be made.
+    """
+
+    def __init__(self, directory: Path, data: Mapping[str, NDArray[Any]]) -> None:
+        self._data = data
+        fields = [("by", "<i8"), *((name, a.dtype, a.shape[1:]) for name, a in data.items())]
+        self._row = np.zeros(1, np.dtype(fields))  # without padding: bytes as they lie in the file
+        self._kept = True
+        try:
+            # Unbuffered: what was written survives the process.
+            self._file = (directory / _FILE).open("a+b", buffering=0)
+        except OSError as error:
+            raise MerlError(f"cannot keep a replay in {directory}: {error.strerror}") from None
+
+    def keep(self, slot: int, by: int) -> None:
+        """Remember a slot that moment number `by` is about to take.
+
+        Where that cannot be written (a full disk), it is told once, and what is overwritten until
+        the next checkpoint would be missing if the run went back to the last one.
+        """
+        if not self._kept:
+            return
+        row = self._row[0]
+        row["by"] = by
+        for name, array in self._data.items():
+            row[name] = array[slot]
+        end = self._file.seek(0, os.SEEK_END)
+        try:
+            whole = self._file.write(self._row.tobytes()) == self._row.nbytes
+            reason = "the disk is full"
+        except OSError as error:
+            whole, reason = False, error.strerror or str(error)
+        if not whole:
+            self._file.truncate(end)
+            self._kept = False
+            _LOG.warning(
+                "what the replay overwrites is not kept until the next checkpoint (%s)", reason
+            )
+
+    def holds(self, moment: int) -> bool:
+        """Whether a moment of that number was overwritten, and can be put back."""
+        return bool((self._rows()["moment"] == moment).any())
+
+    def undo(self, moments: int) -> None:
+        """Put back what moments after number `moments` have overwritten, the newest first."""
+        slots = len(self._data["moment"])
+        for row in self._rows()[::-1]:
+            if row["by"] > moments:
+                for name, array in self._data.items():
+                    array[(row["by"] - 1) % slots] = row[name]
+        self.empty()
+
+    def empty(self) -> None:
+        """Forget all: the ring is as the last checkpoint has it."""
+        self._file.truncate(0)
+        self._kept = True
+
+    def _rows(self) -> NDArray[Any]:
+        """All that is kept; a row that was cut short, by a process that died, is none."""
+        self._file.seek(0)
+        raw = self._file.read()
+        whole = len(raw) // self._row.nbytes * self._row.nbytes
+        return np.frombuffer(raw[:whole], self._row.dtype)

@@ -7,9 +7,10 @@ from typing import Any
 
 from rich.console import RenderableType
 
-from merl.bench import env
+from merl.bench import env, update
 
 BENCHES: dict[str, tuple[Callable[..., dict[str, Any]], Callable[[Any], RenderableType]]] = {
+    "update": (update.run, update.table),
     "env": (env.run, env.table),
 }
 """Name to the measurement and to how its result is shown."""

@@ -6,15 +6,14 @@ them; what counts is the median over the rounds, and the ratio is taken within e
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from importlib import import_module
-from statistics import median
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
+from merl.bench.measuring import circumstances, seconds, shown, spread
 from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.rendering import check_renderer
@@ -40,6 +39,7 @@ def run(repeats: int = 5, steps: int = 60, image_size: int = 84) -> dict[str, An
         dm_control's pictures; or `skipped`, why that side is missing.
     """
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "image_size": image_size}
+    result |= circumstances()
     sides = {
         OURS: _ours(image_size=image_size),
         BLIND: _ours(observations=("proprio",)),
@@ -52,37 +52,37 @@ def run(repeats: int = 5, steps: int = 60, image_size: int = 84) -> dict[str, An
     resets: dict[str, list[float]] = {side: [] for side in sides}
     for _ in range(repeats):
         for side, (reset, step, _) in sides.items():
-            resets[side].append(1e3 * _seconds(reset))
+            resets[side].append(1e3 * seconds(reset))
             count = max(1, steps // 6) if side == THEIRS else steps
-            rates[side].append(count / _seconds(step, count))
+            rates[side].append(count / seconds(step, count))
     for _, _, close in sides.values():
         close()
-    result["steps_per_s"] = {side: _spread(values) for side, values in rates.items()}
-    result["reset_ms"] = {side: _spread(values) for side, values in resets.items()}
+    result["steps_per_s"] = {side: spread(values) for side, values in rates.items()}
+    result["reset_ms"] = {side: spread(values) for side, values in resets.items()}
     if THEIRS in sides:
         pairs = zip(rates[OURS], rates[THEIRS], strict=True)
-        result["ratio"] = _spread([ours / theirs for ours, theirs in pairs])
+        result["ratio"] = spread([ours / theirs for ours, theirs in pairs])
     return result
 
 
 def table(result: dict[str, Any]) -> Table:
     """What `run` returned, for people."""
     size = result["image_size"]
-    shown = Table(
+    rows = Table(
         title=f"reach_duplo, picture {size}x{size}, median of {result['repeats']} (least to most)"
     )
     for heading in ("", "steps/s", "reset, ms"):
-        shown.add_column(heading, justify="right" if heading else "left")
+        rows.add_column(heading, justify="right" if heading else "left")
     for side, rate in result["steps_per_s"].items():
-        shown.add_row(side, _shown(rate), _shown(result["reset_ms"][side]))
+        rows.add_row(side, shown(rate), shown(result["reset_ms"][side]))
     if "ratio" in result:
-        shown.caption = (
-            f"merl / dm_control: {_shown(result['ratio'])}; the bar is {BAR:g}. "
+        rows.caption = (
+            f"merl / dm_control: {shown(result['ratio'])}; the bar is {BAR:g}. "
             f"OpenGL: {result['opengl']}"
         )
     else:
-        shown.caption = f"left out: {result['skipped']}"
-    return shown
+        rows.caption = f"left out: {result['skipped']}"
+    return rows
 
 
 def _ours(**config: Any) -> tuple[Step, Step, Step]:
@@ -112,22 +112,3 @@ def _theirs() -> tuple[tuple[Step, Step, Step], str]:
         lambda: env.step(noise.uniform(spec.minimum, spec.maximum)),
         env.close,
     ), opengl
-
-
-def _seconds(act: Step, times: int = 1) -> float:
-    start = time.perf_counter()
-    for _ in range(times):
-        act()
-    return time.perf_counter() - start
-
-
-def _spread(values: list[float]) -> dict[str, float]:
-    return {"median": median(values), "low": min(values), "high": max(values)}
-
-
-def _shown(spread: dict[str, float]) -> str:
-    middle, low, high = (
-        f"{spread[key]:,.0f}" if spread[key] >= 100 else f"{spread[key]:.3g}"
-        for key in ("median", "low", "high")
-    )
-    return f"{middle} ({low} to {high})"

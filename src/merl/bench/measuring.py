@@ -1,0 +1,62 @@
+"""What every bench does alike: sides that take turns, medians with their spread, the machine."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from statistics import median
+from typing import Any
+
+import torch
+
+from merl.training.run import machine, package_versions
+
+Work = Callable[[], object]
+
+
+def take_turns(sides: Mapping[str, Work], repeats: int) -> dict[str, list[float]]:
+    """Seconds of each side in each round, after a first one that does not count.
+
+    The sides take turns within one run, so that a machine that is busy for a while is busy for all
+    of them.
+    """
+    for work in sides.values():
+        work()
+    taken: dict[str, list[float]] = {side: [] for side in sides}
+    for _ in range(repeats):
+        for side, work in sides.items():
+            taken[side].append(seconds(work))
+    return taken
+
+
+def seconds(work: Work, times: int = 1) -> float:
+    """Of doing it so many times."""
+    start = time.perf_counter()
+    for _ in range(times):
+        work()
+    return time.perf_counter() - start
+
+
+def spread(values: list[float]) -> dict[str, float]:
+    """Median, least and most."""
+    return {"median": median(values), "low": min(values), "high": max(values)}
+
+
+def shown(spread: dict[str, float]) -> str:
+    """The median and, in brackets, from where to where."""
+    middle, low, high = (
+        f"{spread[key]:,.0f}" if spread[key] >= 100 else f"{spread[key]:.3g}"
+        for key in ("median", "low", "high")
+    )
+    return f"{middle} ({low} to {high})"
+
+
+def circumstances() -> dict[str, Any]:
+    """Under which a figure was measured."""
+    return {
+        "machine": machine(),
+        "versions": package_versions(),
+        "threads": torch.get_num_threads(),
+        "load": os.getloadavg()[0],
+    }

@@ -1,0 +1,233 @@
+"""How fast an update is, against the same update written plainly.
+
+On the same work: 84x84 pictures, three frames, 24 numbers of proprioception, 9 actions, batch 256;
+MERL with the heads of six layers that the paper has for `move_box` and `lift_box`, and DrQ-v2.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from rich.table import Table
+from torch import Tensor
+
+from merl.agents import AGENTS, make_agent
+from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
+from merl.bench.plain import Encoder, Plain, Sample
+from merl.core import Batch, MerlError
+
+SIDE, STACK, PROPRIO, ACTIONS, LAYERS = 84, 3, 24, 9, 6
+REFERENCE, OURS, DRQV2, OUR_DRQV2, SB3 = (
+    "reference, MERL, fp32",
+    "merl, MERL",
+    "reference, pixels only (DrQ-v2), fp32",
+    "merl, DrQ-v2",
+    "Stable-Baselines3 TD3",
+)
+SB3_DIFFERS = (
+    "its own work: no random shift, no 3-step returns for Dict observations, no LayerNorm, no "
+    "fusion; it averages the encoder too, and samples from its buffer"
+)
+BARS = {f"{OURS}, bf16": 6.0, f"{OURS}, fp32": 1.5}
+"""How many times as fast as the reference it is to be, on two cores with AMX-bf16."""
+
+
+def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
+    """Time an update on every side, on all threads of this process.
+
+    Args:
+        repeats: how many rounds, in each of which every side makes one update.
+        batch_size: B.
+
+    Returns:
+        Plain values: `updates_per_s` by side and `ratio` (to the reference of the same agent,
+        within each round), each as `median`, `low` and `high` over the rounds; `skipped`, why a
+        side is missing; the circumstances.
+    """
+    result: dict[str, Any] = {"repeats": repeats, "batch_size": batch_size} | circumstances()
+    batch = _batch(batch_size)
+    sides: dict[str, Work] = {}
+    of: dict[str, str] = {}
+    for reference, ours, agent in ((REFERENCE, OURS, "merl"), (DRQV2, OUR_DRQV2, "drqv2")):
+        plain, sample = reference_of(agent), as_sample(batch, vector=agent == "merl")
+        sides[reference] = lambda plain=plain, sample=sample: plain.update(sample)  # type: ignore[misc]
+        for precision in ("fp32", "bf16"):
+            config = dataclasses.replace(AGENTS[agent], precision=precision)
+            if agent == "merl":
+                config = dataclasses.replace(config, head_layers=LAYERS)
+            learner = make_agent(
+                config,
+                _space(),
+                spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32),
+                frame_stack=STACK,
+                seed=0,
+                device=torch.device("cpu"),
+            )
+            name = f"{ours}, {precision}"
+            sides[name] = lambda learner=learner: learner.update(batch)  # type: ignore[misc]
+            of[name] = reference
+    try:
+        sides[SB3] = _stable_baselines(batch_size)
+        of[SB3], result["stable_baselines"] = REFERENCE, SB3_DIFFERS
+    except MerlError as reason:
+        result["skipped"] = f"{SB3}: {reason}"
+    taken = take_turns(sides, repeats)
+    result["updates_per_s"] = {
+        side: spread([1 / t for t in times]) for side, times in taken.items()
+    }
+    result["ratio"] = {
+        side: spread([theirs / t for theirs, t in zip(taken[reference], taken[side], strict=True)])
+        for side, reference in of.items()
+    }
+    return result
+
+
+def table(result: dict[str, Any]) -> Table:
+    """What `run` returned, for people."""
+    title = f"an update, batch {result['batch_size']}, median of {result['repeats']}"
+    rows = Table(title=f"{title} (least to most), {result['threads']} threads")
+    for heading in ("", "updates/s", "times the reference", "bar"):
+        rows.add_column(heading, justify="right" if heading else "left")
+    for side, rate in result["updates_per_s"].items():
+        ratio = result["ratio"].get(side)
+        bar = BARS.get(side)
+        rows.add_row(side, shown(rate), shown(ratio) if ratio else "", f"{bar:g}" if bar else "")
+    notes = ["the bars are for two cores with AMX-bf16"]
+    if "skipped" in result:
+        notes.append(f"left out: {result['skipped']}")
+    if "stable_baselines" in result:
+        notes.append(f"{SB3} is {result['stable_baselines']}")
+    rows.caption = "; ".join(notes)
+    return rows
+
+
+def reference_of(agent: str) -> Plain:
+    """The plain form of `merl` or `drqv2`, in the size that is timed."""
+    channels = 3 * STACK
+    if agent == "merl":
+        return Plain(channels, SIDE, PROPRIO, ACTIONS, layers=LAYERS)
+    return Plain(
+        channels,
+        SIDE,
+        0,
+        ACTIONS,
+        layers=3,
+        latent=50,
+        head_norm=False,
+        average_fusion=True,
+    )
+
+
+def as_sample(batch: Batch, *, vector: bool) -> Sample:
+    """A batch of replay's as a newcomer would keep it: frames stacked as channels."""
+
+    def stacked(images: Tensor) -> Tensor:  # (B, K, H, W, C) to (B, K C, H, W)
+        return images.permute(0, 1, 4, 2, 3).flatten(1, 2).contiguous()
+
+    seen, then = batch.observation, batch.next_observation
+    return Sample(
+        stacked(seen["image"]),
+        seen["proprio"] if vector else seen["proprio"][:, :0],
+        batch.action,
+        batch.reward[:, None],
+        batch.discount[:, None],
+        stacked(then["image"]),
+        then["proprio"] if vector else then["proprio"][:, :0],
+    )
+
+
+def _space() -> spaces.Dict:
+    return spaces.Dict(
+        {
+            "image": spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8),
+            "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO,), np.float32),
+        }
+    )
+
+
+def _batch(size: int) -> Batch:
+    """A batch of noise, always the same."""
+    generator = torch.Generator().manual_seed(0)
+
+    def observation() -> dict[str, Tensor]:
+        shape = (size, STACK, SIDE, SIDE, 3)
+        return {
+            "image": torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator),
+            "proprio": torch.randn((size, PROPRIO), generator=generator),
+        }
+
+    action = torch.rand((size, ACTIONS), generator=generator) * 2 - 1
+    reward = torch.rand(size, generator=generator)
+    return Batch(observation(), action, reward, torch.full((size,), 0.97), observation())
+
+
+def _stable_baselines(batch_size: int) -> Work:
+    """An update of its TD3 with the same encoder.
+
+    Raises:
+        MerlError: it is not installed.
+    """
+    try:
+        from stable_baselines3 import TD3
+        from stable_baselines3.common.logger import Logger
+        from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+    except ImportError:
+        raise MerlError('not installed: pip install "merl[bench]"') from None
+
+    class Extractor(BaseFeaturesExtractor):  # type: ignore[misc]
+        """The convolutions and the joints, side by side."""
+
+        def __init__(self, observation_space: spaces.Dict) -> None:
+            encoder = Encoder(3 * STACK, SIDE)
+            super().__init__(observation_space, encoder.features + PROPRIO)
+            self.encoder = encoder
+
+        def forward(self, observation: dict[str, Tensor]) -> Tensor:
+            encoded = self.encoder(observation["image"])
+            return torch.cat([encoded, observation["proprio"]], dim=-1)
+
+    env = _Idle()
+    model = TD3(
+        "MultiInputPolicy",
+        env,
+        learning_rate=1e-4,
+        buffer_size=batch_size,
+        batch_size=batch_size,
+        tau=0.01,
+        policy_delay=1,
+        policy_kwargs={
+            "features_extractor_class": Extractor,
+            "net_arch": [1024] * (LAYERS - 1),
+            "share_features_extractor": True,
+            "normalize_images": False,
+        },
+        device="cpu",
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    noise = np.random.default_rng(0)
+    for _ in range(batch_size):
+        seen, then = (
+            {key: value[None] for key, value in env.observation_space.sample().items()}
+            for _ in range(2)
+        )
+        action, reward = noise.uniform(-1, 1, (1, ACTIONS)), noise.uniform(0, 1, 1)
+        model.replay_buffer.add(seen, then, action, reward, np.array([False]), [{}])
+    return lambda: model.train(gradient_steps=1, batch_size=batch_size)
+
+
+class _Idle(gymnasium.Env[Any, Any]):
+    """Spaces, for who wants an environment before it can learn."""
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Dict(
+            {
+                "image": spaces.Box(0, 255, (3 * STACK, SIDE, SIDE), np.uint8),
+                "proprio": spaces.Box(-1.0, 1.0, (PROPRIO,), np.float32),
+            }
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)

@@ -14,12 +14,8 @@ for seed in "$@"; do
   for task in ${TASKS:-reach_duplo move_box lift_box}; do
     for agent in ${AGENTS:-ddpg sac merl_state}; do
       name=$task-$agent-$preset-$setting-s$seed; run=runs/agents/$name
-      if [ ! -d "$run" ]; then
-        merl train "$task" --agent "$agent" --setting "$setting" --preset "$preset" --steps "$steps" \
-          --seed "$seed" --threads 1 --eval.video none --run-dir "$run"
-      else
-        merl resume "$run" --steps "$steps"
-      fi
+      merl train "$task" --agent "$agent" --setting "$setting" --preset "$preset" --steps "$steps" \
+        --seed "$seed" --threads 1 --eval.video none --run-dir "$run" --resume
       cp "$run/metrics.csv" "docs/data/agents/$name.csv"
       merl evaluate "$run" --episodes 50 --json "docs/data/agents/$name-evaluation.json"
     done

@@ -40,6 +40,12 @@ def test_pendulum_soon_swings_better_than_at_rest(agent: str, tmp_path: Path) ->
     assert early > sum(still) / len(still) / 2
 
 
+def test_the_dot_soon_comes_nearer_than_at_rest(tmp_path: Path) -> None:
+    still = returns_of(lambda env: 0 * env.best_action(), WHOLE)
+    early = mean_return(WHOLE, "merl", 0, tmp_path, steps=2500)
+    assert early > (sum(still) / len(still) + optimum(WHOLE)) / 2
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("agent", ["merl", "drqv2"])
 def test_the_dot_is_steered_to_the_mark(agent: str, tmp_path: Path) -> None:

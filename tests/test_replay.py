@@ -157,6 +157,7 @@ configs = st.builds(
     n_step=st.integers(1, 5),
     frame_stack=st.integers(1, 4),
     discount=st.sampled_from([0.0, 0.5, 0.99, 1.0]),
+    compress=st.booleans(),
 )
 plans = st.lists(
     st.builds(Episode, st.integers(0, 9), st.sampled_from(["end", "limit", "cut"])),

@@ -7,10 +7,11 @@ from typing import Any
 
 from rich.console import RenderableType
 
-from merl.bench import env, update
+from merl.bench import env, replay, update
 
 BENCHES: dict[str, tuple[Callable[..., dict[str, Any]], Callable[[Any], RenderableType]]] = {
     "update": (update.run, update.table),
     "env": (env.run, env.table),
+    "replay": (replay.run, replay.table),
 }
 """Name to the measurement and to how its result is shown."""

@@ -1,15 +1,16 @@
 """What a ring overwrote since the last checkpoint, so that a run can go back to it exactly.
 
 A ring that has wrapped writes over its oldest moments, which the last checkpoint still counted on.
-Each of these is appended to `overwritten.journal` before its slot is taken: the number of the
-moment that takes it, then the slot's fields. A checkpoint that is on the disk empties the file.
+Each of these is appended to `overwritten.journal` before: the number of the moment that takes its
+place, the fields of its slot, and its compressed pictures. A checkpoint that is on the disk empties
+the file.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
+from merl.replay.compression import CompressedPictures
 
 _FILE = "overwritten.journal"
 _LOG = logging.getLogger(__name__)
@@ -28,13 +30,19 @@ class Journal:
     Args:
         directory: the ring's.
         data: the ring's arrays, (slots, *shape) each.
+        pictures: its compressed pictures, by the name of their field.
 
     Raises:
         MerlError: the file cannot be made.
     """
 
-    def __init__(self, directory: Path, data: Mapping[str, NDArray[Any]]) -> None:
-        self._data = data
+    def __init__(
+        self,
+        directory: Path,
+        data: Mapping[str, NDArray[Any]],
+        pictures: Mapping[str, CompressedPictures],
+    ) -> None:
+        self._data, self._pictures = data, pictures
         fields = [("by", "<i8"), *((name, a.dtype, a.shape[1:]) for name, a in data.items())]
         self._row = np.zeros(1, np.dtype(fields))  # without padding: bytes as they lie in the file
         self._kept = True
@@ -45,7 +53,7 @@ class Journal:
             raise MerlError(f"cannot keep a replay in {directory}: {error.strerror}") from None
 
     def keep(self, slot: int, by: int) -> None:
-        """Remember a slot that moment number `by` is about to take.
+        """Remember what a slot has, which moment number `by` is about to overwrite.
 
         Where that cannot be written (a full disk), it is told once, and what is overwritten until
         the next checkpoint would be missing if the run went back to the last one.
@@ -56,9 +64,10 @@ class Journal:
         row["by"] = by
         for name, array in self._data.items():
             row[name] = array[slot]
+        record = self._row.tobytes() + b"".join(p.read(slot) for p in self._pictures.values())
         end = self._file.seek(0, os.SEEK_END)
         try:
-            whole = self._file.write(self._row.tobytes()) == self._row.nbytes
+            whole = self._file.write(record) == len(record)
             reason = "the disk is full"
         except OSError as error:
             whole, reason = False, error.strerror or str(error)
@@ -71,15 +80,18 @@ class Journal:
 
     def holds(self, moment: int) -> bool:
         """Whether a moment of that number was overwritten, and can be put back."""
-        return bool((self._rows()["moment"] == moment).any())
+        return any(row["moment"] == moment for row, _ in self._records())
 
     def undo(self, moments: int) -> None:
         """Put back what moments after number `moments` have overwritten, the newest first."""
         slots = len(self._data["moment"])
-        for row in self._rows()[::-1]:
+        for row, pictures in reversed(list(self._records())):
             if row["by"] > moments:
+                slot = (row["moment"] - 1) % slots
                 for name, array in self._data.items():
-                    array[(row["by"] - 1) % slots] = row[name]
+                    array[slot] = row[name]
+                for name, kept in pictures.items():
+                    self._pictures[name].restore(slot, kept)
         self.empty()
 
     def empty(self) -> None:
@@ -87,9 +99,18 @@ class Journal:
         self._file.truncate(0)
         self._kept = True
 
-    def _rows(self) -> NDArray[Any]:
-        """All that is kept; a row that was cut short, by a process that died, is none."""
+    def _records(self) -> Iterator[tuple[Any, dict[str, bytes]]]:
+        """All that is kept; one that was cut short, by a process that died, is none."""
         self._file.seek(0)
         raw = self._file.read()
-        whole = len(raw) // self._row.nbytes * self._row.nbytes
-        return np.frombuffer(raw[:whole], self._row.dtype)
+        at, size = 0, self._row.nbytes
+        while at + size <= len(raw):
+            row = np.frombuffer(raw, self._row.dtype, 1, at)[0]
+            at += size
+            pictures = {}
+            for name in self._pictures:
+                count = int(row[f"{name}.span"][1])
+                pictures[name] = raw[at : at + count]
+                at += count
+            if at <= len(raw):
+                yield row, pictures

@@ -16,6 +16,7 @@ overwritten from then on goes into a journal, from which `load_state_dict` puts 
 
 from __future__ import annotations
 
+import logging
 import mmap
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,9 +29,18 @@ import torch
 from numpy.typing import NDArray
 
 from merl.core import Batch, MerlError, Observation, Transition
+from merl.replay.compression import CompressedPictures
 from merl.replay.config import ReplayConfig, check_fits, slots_for
 from merl.replay.journal import Journal
-from merl.replay.storage import check_value, field_name, fields_of, open_files
+from merl.replay.storage import (
+    check_value,
+    field_name,
+    fields_of,
+    open_files,
+    span_name,
+)
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -82,29 +92,43 @@ class Replay:
         check_fits(
             config, observation_space, action_space, directory=directory, capacity=self.capacity
         )
-        fields = fields_of(observation_space, action_space)
+        fields = fields_of(observation_space, action_space, config.compress)
         slots = slots_for(self.capacity, config.frame_stack)
         self._files: dict[str, mmap.mmap] = {}
-        self._data: dict[str, NDArray[Any]]
-        self._journal: Journal | None = None
+        arrays: dict[str, NDArray[Any]]
         if directory is None:
-            self._data = {
+            arrays = {
                 name: np.zeros((slots, *field.shape), field.dtype) for name, field in fields.items()
             }
         else:
             self._files = open_files(directory, fields, slots, self.capacity)
-            self._data = {
+            arrays = {
                 name: np.frombuffer(self._files[name], field.dtype).reshape(-1, *field.shape)
                 for name, field in fields.items()
             }
-            self._journal = Journal(directory, self._data)
         self._keys = {key: field_name(key) for key in observation_space.spaces}
+        self._pictures = {
+            name: CompressedPictures(
+                arrays.pop(name).reshape(-1),
+                arrays[span_name(key)],
+                observation_space[key].shape or (),
+                None if directory is None else directory / f"{name}.background",
+            )
+            for key, name in self._keys.items()
+            if span_name(key) in fields
+        }
+        self._data = arrays  # a row for each slot
+        self._values = {**fields_of(observation_space, action_space)}  # what is written
+        self._journal: Journal | None = None
+        if directory is not None:
+            self._journal = Journal(directory, self._data, self._pictures)
         self._slots = len(self._data["moment"])
         self._moments = self._steps = 0  # ever written
         self._first = 0  # the oldest step that can be sampled
-        self._gap = 0  # the newest moment that went missing when the ring was opened again
+        self._oldest = 1  # the oldest moment that is held
         self._open = False  # an episode is in progress
         self._settled = 0  # the newest moment of the last checkpoint
+        self._told = False  # that fewer steps are held than asked for
         # Step i led away from moment _sources[i mod capacity].
         self._sources = np.zeros(self.capacity, np.int64)
         self._take_over(moments=int(self._data["moment"].max()))
@@ -120,6 +144,8 @@ class Replay:
             MerlError: the observation does not fit the space.
         """
         self._write(observation, position=0, action=None, reward=0.0, discount=1.0)
+        for name, pictures in self._pictures.items():
+            pictures.begun(next(observation[key] for key, n in self._keys.items() if n == name))
         self._open = True
 
     def add(self, transition: Transition) -> None:
@@ -227,14 +253,16 @@ class Replay:
         values = {name: observation.get(key) for key, name in self._keys.items()}
         values["action"] = np.zeros_like(data["action"][0]) if action is None else action
         for name, value in values.items():
-            check_value(name, value, data[name])
+            field = self._values[name]
+            check_value(name, value, field.dtype, field.shape)
         moment = self._moments + 1
         slot = self._slot(moment)
-        if self._journal is not None and 0 < data["moment"][slot] <= self._settled:
-            self._journal.keep(slot, by=moment)
-        data["moment"][slot] = 0  # while it is written it is no moment, should the process die here
+        kept = {n: p.encode(np.asarray(values.pop(n))) for n, p in self._pictures.items()}
+        self._make_room(moment, kept)
         for name, value in values.items():
             data[name][slot] = value
+        for name, picture in kept.items():
+            self._pictures[name].write(slot, picture)
         data["position"][slot] = position
         data["reward"][slot] = reward
         data["discount"][slot] = discount
@@ -242,19 +270,41 @@ class Replay:
         self._moments = moment
         self._forget()
 
+    def _make_room(self, moment: int, kept: Mapping[str, bytes]) -> None:
+        """Let go of the oldest moments, as many as moment number `moment` will overwrite."""
+        ends = {name: self._pictures[name].end_of(picture) for name, picture in kept.items()}
+        while self._oldest < moment:
+            slot = self._slot(self._oldest)
+            if self._oldest > moment - self._slots:
+                if not any(self._pictures[n].overwritten(slot, end) for n, end in ends.items()):
+                    break
+                self._tell_of_less()
+            if self._journal is not None and self._oldest <= self._settled:
+                self._journal.keep(slot, by=moment)
+            # From here on it is no moment, should the process die while it is overwritten.
+            self._data["moment"][slot] = 0
+            self._oldest += 1
+
+    def _tell_of_less(self) -> None:
+        """Pictures fill their bytes before the capacity is reached."""
+        if not self._told:
+            self._told = True
+            _LOG.warning(
+                "pictures take more bytes than replay.compress reserves: the replay keeps about "
+                "%s of its %s steps",
+                f"{len(self):,}",
+                f"{self.capacity:,}",
+            )
+
     def _forget(self) -> None:
         """Let go of the oldest steps: beyond the capacity, or with a frame that is overwritten."""
         while self._first < self._steps:
             source = int(self._sources[self._first % self.capacity])
             position = int(self._data["position"][self._slot(source)])
             oldest = source - min(position, self.config.frame_stack - 1)
-            if self._steps - self._first <= self.capacity and oldest > self._lost():
+            if self._steps - self._first <= self.capacity and oldest >= self._oldest:
                 break
             self._first += 1
-
-    def _lost(self) -> int:
-        """The newest moment that is no longer held."""
-        return max(self._moments - self._slots, self._gap)
 
     def _take_over(self, moments: int, steps: int | None = None, in_progress: bool = False) -> None:
         """Go on after moment number `moments`: find the steps that the ring holds up to there.
@@ -269,8 +319,10 @@ class Replay:
         numbers = np.arange(max(0, moments - self._slots) + 1, moments + 1)
         slots = (numbers - 1) % self._slots
         missing = numbers[stamps[slots] != numbers]  # overwritten since, or only half written
-        self._gap = int(missing[-1]) if missing.size else 0
-        leads = (numbers[:-1] > self._gap) & (self._data["position"][slots[1:]] > 0)
+        self._oldest = int(missing[-1] if missing.size else moments - len(numbers)) + 1
+        for pictures in self._pictures.values():
+            pictures.go_on_after(self._slot(moments) if moments else None)
+        leads = (numbers[:-1] >= self._oldest) & (self._data["position"][slots[1:]] > 0)
         sources = numbers[:-1][leads][-self.capacity :]
         self._moments, self._open = moments, in_progress
         self._steps = len(sources) if steps is None else steps
@@ -306,6 +358,9 @@ class Replay:
         """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""
         observation = {}
         for key, name in self._keys.items():
+            if name in self._pictures:
+                observation[key] = torch.from_numpy(self._pictures[name].take(slots))
+                continue
             array = self._data[name]
             index = slots if array.dtype == np.uint8 else slots[:, -1]
             observation[key] = torch.from_numpy(array.take(index, axis=0))

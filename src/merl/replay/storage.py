@@ -3,6 +3,8 @@
 `<field>.bin` is the raw little-endian array (slots, *shape) in C order. `replay.json` lists fields,
 types, shapes and the number of slots; it is written last, so a directory that has it is whole. An
 observation's key is quoted as in a URL: `observation.image.bin`, `observation.arm%2Fjoints.bin`.
+Compressed pictures lie behind one another in theirs, `observation.image.span.bin` says where
+(`compression.py`).
 """
 
 from __future__ import annotations
@@ -20,9 +22,9 @@ from urllib.parse import quote
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from merl.core import MerlError, is_image, is_vector
+from merl.replay.compression import reserved_bytes
 from merl.resources import reserve_file
 
 _FORMAT = 1
@@ -43,15 +45,20 @@ class Field:
 
 
 def fields_of(
-    observation_space: gymnasium.spaces.Dict, action_space: gymnasium.spaces.Box
+    observation_space: gymnasium.spaces.Dict,
+    action_space: gymnasium.spaces.Box,
+    compress: bool = False,
 ) -> dict[str, Field]:
-    """The arrays of the ring, by name."""
+    """The arrays of the ring, by name; of compressed pictures their bytes and their spans."""
     fields: dict[str, Field] = {}
     for key, space in observation_space.spaces.items():
         shape = space.shape or ()
         whole = isinstance(space, gymnasium.spaces.Box) and math.prod(shape) > 0
         if whole and is_image(space):
             dtype: np.dtype[Any] = np.dtype("u1")
+            if compress:
+                shape = (reserved_bytes(math.prod(shape)),)
+                fields[span_name(key)] = Field(np.dtype("<i8"), (2,))
         elif whole and is_vector(space):
             dtype = np.dtype("<f4")
         else:
@@ -75,18 +82,21 @@ def field_name(key: str) -> str:
     return f"observation.{quote(key, safe='')}"
 
 
-def check_value(name: str, value: Any, array: NDArray[Any]) -> None:
-    """Raise MerlError unless the value can be stored in one slot of the array as it is."""
+def span_name(key: str) -> str:
+    """The field that says where a key's compressed pictures lie."""
+    return f"{field_name(key)}.span"
+
+
+def check_value(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    """Raise MerlError unless the value can be kept as it is in so many numbers of this type."""
     if value is None:
         raise MerlError(f"{name} is missing, although the observation space has it")
     value = np.asarray(value)
-    kind_fits = value.dtype.kind == array.dtype.kind and (
-        array.dtype != np.uint8 or value.dtype == np.uint8
-    )
-    if value.shape != array.shape[1:] or not kind_fits:
+    kind_fits = value.dtype.kind == dtype.kind and (dtype != np.uint8 or value.dtype == np.uint8)
+    if value.shape != shape or not kind_fits:
         raise MerlError(
             f"{name} is {value.dtype} {value.shape}, but its space says "
-            f"{array.dtype} {array.shape[1:]}: mend what the environment or the agent returns"
+            f"{dtype} {shape}: mend what the environment or the agent returns"
         )
 
 
@@ -165,7 +175,18 @@ def _held_slots(header: Path, fields: dict[str, Field], text: str) -> tuple[int,
     if not whole:
         raise MerlError(f"{directory} holds a truncated replay: give another folder")
     newest = np.fromfile(directory / "moment.bin", "<i8", held).max(initial=0)
-    return held, bool(newest > held)
+    return held, bool(newest > held) or _bytes_wrapped(directory, fields, held)
+
+
+def _bytes_wrapped(directory: Path, fields: dict[str, Field], held: int) -> bool:
+    """Whether compressed pictures have come to the end of their bytes."""
+    for name, field in fields.items():
+        spans = directory / f"{name}.span.bin"
+        if f"{name}.span" in fields:
+            ends = np.fromfile(spans, "<i8", 2 * held).reshape(-1, 2).sum(axis=1)
+            if ends.max(initial=0) > held * field.bytes:
+                return True
+    return False
 
 
 def _header_text(fields: dict[str, Field], slots: int, capacity: int) -> str:

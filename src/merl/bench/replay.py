@@ -1,0 +1,173 @@
+"""How long the replay takes to give a batch, raw and compressed, and the space that it needs.
+
+A batch is 256 pairs of observations, of three 84x84 pictures each, that are stacked, shifted and
+turned into what the encoder reads. The pictures are an arm's, moved at random.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from rich.table import Table
+
+from merl.bench.measuring import Work, circumstances, seconds, shown, spread, take_turns
+from merl.core import Transition
+from merl.envs import make_env
+from merl.networks.augmentation import draw_shifts, shift, to_input
+from merl.replay import Replay, ReplayConfig, replay_bytes
+
+EPISODE, PAD, MILLION = 250, 4, 1_000_000
+RAW, COMPRESSED = "raw", "compressed (--replay.compress)"
+BARS_MS = {RAW: 15.0, COMPRESSED: 35.0}
+BARS_GB = {RAW: 22.0, COMPRESSED: 6.0}
+
+
+def run(repeats: int = 15, steps: int = 10_000, batch_size: int = 256) -> dict[str, Any]:
+    """Time a batch on both sides, on one thread.
+
+    Args:
+        repeats: how many rounds, in each of which each side gives a batch.
+        steps: that each ring holds; far more than a cache does.
+        batch_size: B.
+
+    Returns:
+        Plain values, by side: `sample_ms` and `ready_ms` (what is sampled, and that shifted and
+        turned into input) and `write_us` for a step, each as `median`, `low` and `high`;
+        `picture_bytes`, what a picture of this task takes; `gigabytes`, what a million steps
+        reserve; the circumstances.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _run(repeats, steps, batch_size)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def table(result: dict[str, Any]) -> Table:
+    """What `run` returned, for people."""
+    title = f"{result['batch_size']} pairs of 3 pictures 84x84 from {result['steps']:,} steps"
+    rows = Table(title=f"{title}, one thread, median of {result['repeats']} (least to most)")
+    for heading in (
+        "",
+        "sampled, ms",
+        "ready for the network, ms",
+        "bar",
+        "write a step, us",
+        "a picture, bytes",
+        "a million steps, GB",
+        "bar ",
+    ):
+        rows.add_column(heading, justify="right" if heading else "left")
+    for side in (RAW, COMPRESSED):
+        rows.add_row(
+            side,
+            shown(result["sample_ms"][side]),
+            shown(result["ready_ms"][side]),
+            f"{BARS_MS[side]:g}",
+            shown(result["write_us"][side]),
+            f"{result['picture_bytes'][side]:,.0f}",
+            f"{result['gigabytes'][side]:.3g}",
+            f"{BARS_GB[side]:g}",
+        )
+    return rows
+
+
+def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
+    result: dict[str, Any] = {"repeats": repeats, "steps": steps, "batch_size": batch_size}
+    result |= circumstances()
+    space, actions, seen = _pictures()
+    million = {
+        side: replay_bytes(ReplayConfig(compress=side == COMPRESSED), space, actions, MILLION) / 1e9
+        for side in BARS_GB
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        rings: dict[str, Replay] = {}
+        writing, sizes = {}, {}
+        for side in BARS_MS:
+            config = ReplayConfig(
+                capacity=steps, batch_size=batch_size, compress=side == COMPRESSED
+            )
+            directory = Path(folder) / str(len(rings))
+            rings[side] = Replay(config, space, actions, directory=directory)
+            writing[side] = _fill(rings[side], seen, actions, steps)
+            sizes[side] = _mean_bytes(directory, space)
+        sampling = take_turns(
+            {side: _sampler(ring, batch_size) for side, ring in rings.items()}, repeats
+        )
+        ready = take_turns(
+            {side: _readier(ring, batch_size) for side, ring in rings.items()}, repeats
+        )
+    return result | {
+        "sample_ms": {side: spread([1e3 * t for t in times]) for side, times in sampling.items()},
+        "ready_ms": {side: spread([1e3 * t for t in times]) for side, times in ready.items()},
+        "write_us": {side: spread(times) for side, times in writing.items()},
+        "picture_bytes": sizes,
+        "gigabytes": million,
+    }
+
+
+def _pictures() -> tuple[spaces.Dict, spaces.Box, list[dict[str, Any]]]:
+    """The spaces, and observations of some episodes."""
+    env = make_env("reach_duplo", renderer="warp")
+    space, actions = env.observation_space, env.action_space
+    assert isinstance(space, spaces.Dict)
+    assert isinstance(actions, spaces.Box)
+    seen = []
+    for episode in range(8):
+        observation, _ = env.reset(seed=episode)
+        actions.seed(episode)
+        for _ in range(5):
+            action = actions.sample()
+            for _ in range(10):
+                seen.append(observation)
+                observation, *_ = env.step(action)
+    env.close()
+    return space, actions, seen
+
+
+def _fill(ring: Replay, seen: list[dict[str, Any]], actions: spaces.Box, steps: int) -> list[float]:
+    """Write the observations over and over; microseconds a step, by episode."""
+    action = actions.sample().astype(np.float32)
+    taken: list[float] = []
+    for begin in range(0, steps, EPISODE):
+        ring.begin(seen[begin % len(seen)])
+
+        def episode(begin: int = begin) -> None:
+            for step in range(1, EPISODE + 1):
+                observation = seen[(begin + step) % len(seen)]
+                ring.add(Transition(action, 0.0, 1.0, observation, step == EPISODE))
+
+        taken.append(1e6 * seconds(episode) / EPISODE)
+    return taken
+
+
+def _mean_bytes(directory: Path, space: spaces.Dict) -> float:
+    """Of a picture, as it lies there."""
+    spans = directory / "observation.image.span.bin"
+    if not spans.exists():
+        return float(np.prod(space["image"].shape or ()))
+    lengths = np.fromfile(spans, "<i8").reshape(-1, 2)[:, 1]
+    return float(lengths[lengths > 0].mean())
+
+
+def _sampler(ring: Replay, batch_size: int) -> Work:
+    rng = np.random.default_rng(0)
+    return lambda: ring.sample(batch_size, rng)
+
+
+def _readier(ring: Replay, batch_size: int) -> Work:
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+
+    def ready() -> None:
+        batch = ring.sample(batch_size, rng)
+        for observation in (batch.observation, batch.next_observation):
+            shifts = draw_shifts(batch_size, PAD, generator)
+            to_input(shift(observation["image"], shifts, PAD), torch.float32)
+
+    return ready

@@ -1,0 +1,21 @@
+"""The bench runs and says what it measured; the figures themselves are not tested."""
+
+import json
+
+from rich.console import Console
+
+from merl.bench import replay as bench
+
+
+def test_both_sides_are_timed():
+    result = bench.run(repeats=1, steps=500, batch_size=4)
+    assert json.loads(json.dumps(result)) == result
+    console = Console(width=300)
+    with console.capture() as capture:
+        console.print(bench.table(result))
+    shown = capture.get()
+    for side in (bench.RAW, bench.COMPRESSED):
+        assert side in shown
+        assert 0 < result["sample_ms"][side]["median"] <= result["ready_ms"][side]["high"]
+        assert result["gigabytes"][side] <= bench.BARS_GB[side]
+    assert result["picture_bytes"][bench.COMPRESSED] < result["picture_bytes"][bench.RAW] / 4

@@ -1,0 +1,190 @@
+"""The compressed replay gives what the raw one gives, byte for byte, in a quarter of the space."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+import merl
+from merl.core import Batch, Transition
+from merl.replay import Replay, ReplayConfig, replay_bytes
+from merl.replay.compression import STAGES, CompressedPictures
+
+SIDE = 16
+NOISE = spaces.Dict({"image": spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)})
+ACTIONS = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+def config(**values: object) -> ReplayConfig:
+    return ReplayConfig(**({"capacity": 60, "batch_size": 4, "compress": True} | values))  # type: ignore[arg-type]
+
+
+def noise(number: int) -> dict[str, np.ndarray]:
+    """What no compression makes smaller."""
+    rng = np.random.default_rng(number)
+    return {"image": rng.integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)}
+
+
+def play(replay: Replay, begin: int, steps: int, length: int = 7) -> None:
+    """Moments `begin`, ...: the picture has the moment's number, the action its step's."""
+    for moment in range(begin, begin + steps):
+        if moment % length == 0:
+            replay.begin(noise(moment))
+        else:
+            action = np.array([moment / 1000], np.float32)
+            last = moment % length == length - 1
+            replay.add(Transition(action, float(moment), 1.0, noise(moment), last))
+
+
+class Every:
+    def integers(self, low: int, high: int, size: int) -> np.ndarray:
+        return np.arange(low, high)
+
+
+def everything(replay: Replay) -> Batch:
+    return replay.sample(len(replay), Every())  # type: ignore[arg-type]
+
+
+def assert_right(batch: Batch, newest: int) -> None:
+    """Step k led to moment k; all up to the newest are there, and their pictures are theirs."""
+    moments = (batch.action[:, 0] * 1000).round().int().tolist()
+    assert moments[-1] == newest
+    assert moments == [m for m in range(moments[0], newest + 1) if m % 7]
+    for row, moment in enumerate(moments):
+        begun = moment - moment % 7
+        stack = [max(begun, moment - 1 - back) for back in (2, 1, 0)]
+        expected = np.stack([noise(m)["image"] for m in stack])
+        np.testing.assert_array_equal(batch.observation["image"][row], expected)
+
+
+def assert_same(one: Batch, other: Batch) -> None:
+    assert torch.equal(one.action, other.action)
+    assert torch.equal(one.reward, other.reward)
+    for a, b in (
+        (one.observation, other.observation),
+        (one.next_observation, other.next_observation),
+    ):
+        assert all(torch.equal(a[key], b[key]) for key in a)
+
+
+@pytest.mark.parametrize("renderer", ["warp"])
+def test_it_gives_what_the_raw_one_gives(tmp_path: Path, renderer: str) -> None:
+    env = merl.make_env("move_box", renderer=renderer, image_size=48)
+    space, actions = env.observation_space, env.action_space
+    raw, packed = (
+        Replay(config(capacity=200, compress=c), space, actions, directory=tmp_path / str(c))
+        for c in (False, True)
+    )
+    for episode in range(6):  # so that backgrounds change twice
+        observation, _ = env.reset(seed=episode)
+        for replay in (raw, packed):
+            replay.begin(observation)
+        for step in range(20):
+            action = env.action_space.sample()
+            observation, reward, *_ = env.step(action)
+            for replay in (raw, packed):
+                replay.add(Transition(action, float(reward), 1.0, observation, step == 19))
+    env.close()
+    assert_same(everything(raw), everything(packed))
+    packed = Replay(config(capacity=200), space, actions, directory=tmp_path / "True")
+    assert_same(everything(raw), everything(packed))
+    spans = np.fromfile(tmp_path / "True" / "observation.image.span.bin", "<i8").reshape(-1, 2)
+    kept = spans[spans[:, 1] > 0, 1]
+    assert len(kept) == 126
+    assert kept.mean() < 48 * 48 * 3 / 4
+
+
+def test_a_million_steps_take_at_most_six_gigabytes() -> None:
+    env = merl.make_env("reach_duplo", renderer="warp")
+    spaces_ = env.observation_space, env.action_space
+    env.close()
+    assert replay_bytes(ReplayConfig(compress=True), *spaces_) <= 6e9  # type: ignore[arg-type]
+    assert replay_bytes(ReplayConfig(), *spaces_) <= 22e9  # type: ignore[arg-type]
+
+
+def test_pictures_that_take_more_than_is_reserved_cost_steps_and_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    for moment in range(0, 245, 7):
+        play(replay, moment, 7)
+        assert_right(everything(replay), moment + 6)
+    assert 10 < len(replay) < 30
+    assert caplog.text.count("pictures take more bytes than replay.compress reserves") == 1
+
+
+def test_it_is_opened_again_as_it_was(tmp_path: Path) -> None:
+    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    for begin in range(0, 140, 10):
+        play(replay, begin, 10)
+        before = everything(replay)
+        again = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+        assert_same(everything(again), before)
+
+
+def test_it_goes_back_to_its_last_checkpoint_exactly(tmp_path: Path) -> None:
+    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    play(replay, 0, 140)
+    for begin in range(140, 280, 35):
+        replay.flush()
+        state, before = replay.state_dict(), everything(replay)
+        replay.settle()
+        play(replay, begin, 40)  # most of what was held is overwritten, and the process dies
+        replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+        replay.load_state_dict(state)
+        assert_same(everything(replay), before)
+        play(replay, begin, 35)
+        assert_right(everything(replay), begin + 34)
+
+
+def test_a_picture_half_written_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    play(replay, 0, 144)
+    whole = CompressedPictures.write
+
+    def dies(pictures: CompressedPictures, slot: int, kept: bytes) -> None:
+        whole(pictures, slot, kept)
+        pictures._bytes(slot)[len(kept) // 2 :] = 0
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(CompressedPictures, "write", dies)
+    with pytest.raises(KeyboardInterrupt):
+        play(replay, 144, 1)
+    monkeypatch.undo()
+    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    assert_right(everything(replay), 143)
+
+
+def test_it_does_not_grow_once_its_bytes_have_wrapped(tmp_path: Path) -> None:
+    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    play(replay, 0, 35)
+    before = everything(replay)
+    again = Replay(config(capacity=90), NOISE, ACTIONS, directory=tmp_path)
+    assert_same(everything(again), before)
+    play(again, 35, 70)
+    assert_right(everything(again), 104)
+
+
+def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    still = rng.integers(0, 256, (8, 8, 3)).astype(np.uint8)
+    file = tmp_path / "background"
+    pictures = CompressedPictures(
+        np.zeros(100_000, np.uint8), np.zeros((100, 2), np.int64), (8, 8, 3), file
+    )
+    sizes = []
+    for number in range(STAGES[-1] + 1):
+        picture = still.copy()
+        row, column = rng.integers(0, 6, 2)
+        picture[row : row + 2, column : column + 2] = 255
+        kept = pictures.encode(picture)
+        pictures.write(number, kept)
+        sizes.append(len(kept))
+        pictures.begun(picture)
+        np.testing.assert_array_equal(pictures.take(np.array([[number]]))[0, 0], picture)
+    assert sizes[-1] < sizes[0] / 3
+    assert file.stat().st_size == len(STAGES) * still.nbytes

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -117,3 +119,23 @@ def test_a_full_disk_gives_the_file_its_old_length(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left"):
         reserve_file(file, 5_000_000)
     assert file.read_bytes() == b"abc"
+
+
+def test_freed_memory_is_kept_for_the_next_of_its_size() -> None:
+    program = """
+import resource, sys
+from merl.resources import keep_freed_memory
+assert keep_freed_memory(sys.argv[1] == "keep")
+for _ in range(3):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    block = b"x" * 50_000_000
+    del block
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+    faults = {}
+    for how in ("keep", "default"):
+        command = [sys.executable, "-c", program, how]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        faults[how] = int(done.stdout)
+    assert faults["keep"] < 100
+    assert faults["default"] > 1000

@@ -21,7 +21,7 @@ from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
 from merl.core import MerlError, is_image
 from merl.replay import Replay, check_fits
-from merl.resources import available_memory
+from merl.resources import available_memory, keep_freed_memory
 from merl.training import checkpoint
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
@@ -103,6 +103,7 @@ class Trainer:
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
         check_memory(config, self.space, self.action_space)
+        keep_freed_memory()
         self.timing = measure(config, env, eval_env, self.space, self.device)
         best = self.timing.best
         torch.set_num_threads(best.threads)

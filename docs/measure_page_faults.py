@@ -1,0 +1,63 @@
+"""What keeping freed memory saves: python docs/measure_page_faults.py. One thread, bf16.
+
+An update with glibc's defaults and one with `keep_freed_memory` take turns; processor time, for
+what else the machine does is not to count.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+import time
+from statistics import median
+
+import torch
+from gymnasium import spaces
+
+from merl.agents import make_agent
+from merl.envs import make_env
+from merl.experiments.presets import compose
+from merl.resources import keep_freed_memory
+from merl.training.timing import random_batch
+
+ROUNDS, UPDATES = 6, 3
+
+
+def main() -> None:
+    """Measure and print."""
+    torch.set_num_threads(1)
+    for preset, task, size in (("laptop", "reach_duplo", 48), ("paper", "move_box", 84)):
+        env = make_env(task, renderer="warp", image_size=size)
+        space, actions = env.observation_space, env.action_space
+        assert isinstance(space, spaces.Dict)
+        assert isinstance(actions, spaces.Box)
+        config = compose(preset, task)
+        config = dataclasses.replace(
+            config, agent=dataclasses.replace(config.agent, precision="bf16")
+        )
+        agent = make_agent(
+            config.agent, space, actions, frame_stack=3, seed=0, device=torch.device("cpu")
+        )
+        batch = random_batch(config, space, actions)
+        taken: dict[bool, list[tuple[float, int]]] = {False: [], True: []}
+        for _ in range(ROUNDS):
+            for keep, results in taken.items():
+                keep_freed_memory(keep)
+                agent.update(batch)
+                for _ in range(UPDATES):
+                    faults, begun = _faults(), time.process_time()
+                    agent.update(batch)
+                    results.append((time.process_time() - begun, _faults() - faults))
+        for keep, results in taken.items():
+            seconds, faults = (median(values) for values in zip(*results, strict=True))
+            how = "kept" if keep else "given back"
+            print(f"{preset:8}{how:12}{1e3 * seconds:8.1f} ms{faults:10,.0f} page faults")
+        env.close()
+
+
+def _faults() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+
+if __name__ == "__main__":
+    main()

@@ -68,9 +68,9 @@ def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
     """As a user would: the file lies in the folder where `merl` is called."""
     (tmp_path / "my_arm.py").write_text(TWO_CAMERAS)
 
-    def call(*arguments: str) -> str:
+    def call(*arguments: str, cwd: Path = tmp_path) -> str:
         command = [sys.executable, "-m", "merl.cli", *arguments]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
         assert "Traceback" not in done.stderr
         return done.stdout + done.stderr
@@ -97,7 +97,8 @@ def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
     assert record["observation_space"]["wrist"]["shape"] == [24, 26, 1]
     call("resume", str(run), "--steps", "360")
     assert rows(run)[-1]["step"] == "360"
-    call("evaluate", str(run), "--episodes", "2")
+    (tmp_path / "elsewhere").mkdir()  # the run knows where the module lies
+    call("evaluate", str(run), "--episodes", "2", cwd=tmp_path / "elsewhere")
 
     call(
         *("train", "my_arm:Arm", *SHORT, "--run-dir", "front"),

@@ -48,6 +48,23 @@ def make_own(task: str, render_mode: str | None = None) -> gymnasium.Env[Any, An
         raise
 
 
+def module_folder(task: str) -> Path | None:
+    """Where Python found the module of `module:function` or `module:Id-v0`; None for a plain id."""
+    module, colon, _ = task.partition(":")
+    loaded = sys.modules.get(module.partition(".")[0]) if colon else None
+    file = getattr(loaded, "__file__", None)
+    if file is None:
+        return None
+    path = Path(file).resolve()
+    return path.parent.parent if path.name == "__init__.py" else path.parent
+
+
+def search_also(folder: Path) -> None:
+    """Have Python look for modules in this folder too, after all others."""
+    if str(folder) not in sys.path and folder.is_dir():
+        sys.path.append(str(folder))
+
+
 def adapt(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
     """An environment in the form that agents take.
 

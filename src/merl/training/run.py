@@ -36,6 +36,7 @@ from gymnasium import spaces
 import merl
 from merl.agents import AGENTS
 from merl.core import CONFIG_FILE, MerlError, check_choice
+from merl.envs.own import module_folder, search_also
 from merl.training.config import TrainConfig
 
 LOCK_FILE = "lock"
@@ -62,6 +63,7 @@ class Run:
         """
         path = run_path(config)
         refuse_existing(path)
+        folder = module_folder(config.task)
         record = {
             "format": FORMAT,
             "merl": merl.__version__,
@@ -71,6 +73,7 @@ class Run:
             "setting": config.setting,
             "seed": config.seed,
             "config": to_plain(config),
+            "module_folder": None if folder is None else str(folder),
             "observation_space": {key: _describe(s) for key, s in observation_space.items()},
             "action_space": _describe(action_space),
             "versions": package_versions(),
@@ -104,6 +107,9 @@ class Run:
             config = _read_config(record["config"])
             _recorded_spaces(record)
             _last_machine(record)
+            folder = record.get("module_folder")
+            if folder is not None:  # so that the run works from wherever it is called
+                search_also(Path(folder))
         return cls(path, dataclasses.replace(config, run_dir=path))
 
     def record_resumption(self, step: int) -> None:

@@ -156,7 +156,7 @@ def test_a_folder_that_is_taken_away_is_not_made_anew(tmp_path: Path) -> None:
     process = start(line(folder, "--steps", "100000"))
     wait_until_saved(folder, process)
     folder.rename(tmp_path / "elsewhere")
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=120)
     assert process.returncode == 2
     assert "is gone" in err
     assert "Traceback" not in err

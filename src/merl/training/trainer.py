@@ -229,6 +229,8 @@ class _Stretch:
                 "a resumed run will meet other episodes than this one would: the environment does "
                 "not draw from Gymnasium's np_random"
             )
+        if progress.step == 0:
+            self._save()  # from here on there is something to go on from
         self.clock.mark(progress)
         for moment in train(
             trainer.env,

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from statistics import mean
 
-from merl.report.figures import learning_curves
+from merl.report.figures import learning_curves, reward_terms
 from merl.report.references import references
 
 DOCS = Path(__file__).parent
@@ -20,6 +20,16 @@ def main() -> None:
         x="minutes",
         references=lines,
         title="reach_duplo",
+    )
+    reward_terms(
+        {
+            "move_box": DOCS / "data" / "state-move_box-seed0.csv",
+            "move_box, margin of the goal 0.2 m": DOCS
+            / "data"
+            / "state-move_box-margin20-seed0.csv",
+            "lift_box": DOCS / "data" / "state-lift_box-seed0.csv",
+        },
+        DOCS / "images" / "state.png",
     )
     for seed in range(3):
         print(f"seed {seed}: {mean_return(f'laptop-seed{seed}'):.1f}")

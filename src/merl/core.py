@@ -46,6 +46,12 @@ class NotFinite(MerlError):  # noqa: N818 (a state of affairs, as in `isfinite`)
     exit_code = 3
 
 
+class EnvironmentsLost(MerlError):  # noqa: N818 (what happened, not a mistake)
+    """Environments' processes died or fell silent too often: the run is saved and ends."""
+
+    exit_code = 4
+
+
 def meant(name: str, known: Iterable[str]) -> str:
     """The way out of a name that is unknown: what was perhaps meant, or all that there is."""
     close = get_close_matches(name, list(known), n=1)

@@ -9,9 +9,10 @@ import torch
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
-from merl.replay import Replay, ReplayConfig
+from merl.replay import Lanes, ReplayConfig
+from merl.training.acting import Here
 from merl.training.config import TrainConfig
-from merl.training.loop import Moment, Progress, Randomness, train
+from merl.training.loop import Moment, Progress, Randomness, Stage, train
 from merl.training.rollout import Episode, FrameStack
 from toy import DotEnv
 
@@ -37,22 +38,12 @@ class Parts:
         self.agent: DDPG = make_agent(
             config.agent, space, actions, frame_stack=3, seed=self.randomness.agent, device=CPU
         )
-        self.replay = Replay(config.replay, space, actions, capacity=config.steps)
+        self.replay = Lanes(config.replay, space, actions, capacity=config.steps)
         self.progress = Progress()
-        self.stack = FrameStack(3, ("image",), CPU)
+        self.stage = Stage(Here(self.env), self.replay, [FrameStack(3, ("image",), CPU)])
 
     def run(self) -> list[Moment]:
-        return list(
-            train(
-                self.env,
-                self.agent,
-                self.replay,
-                self.stack,
-                self.progress,
-                self.randomness,
-                self.config,
-            )
-        )
+        return list(train(self.stage, self.agent, self.progress, self.randomness, self.config))
 
     def weights(self) -> torch.Tensor:
         return torch.cat([p.detach().flatten() for p in self.agent.networks.parameters()])
@@ -82,8 +73,8 @@ def test_the_agent_is_told_the_step() -> None:
 def test_yields_every_step_and_tells_of_each_episode() -> None:
     moments = Parts().run()
     assert [m.step for m in moments] == list(range(1, 61))
-    assert [m.step for m in moments if m.episode] == [10, 20, 30, 40, 50, 60]
-    assert all(m.episode.length == 10 for m in moments if m.episode)
+    assert [m.step for m in moments if m.episodes] == [10, 20, 30, 40, 50, 60]
+    assert all(e.length == 10 for m in moments for e in m.episodes)
     assert [m.step for m in moments if m.learning] == list(range(21, 61))
 
 
@@ -120,7 +111,7 @@ def test_the_actors_stack_is_what_replay_samples() -> None:
     parts = Parts(dataclasses.replace(CONFIG, steps=10, seed_steps=10))
     env, stack = DotEnv(), FrameStack(3, ("image",), CPU)
     parts.run()
-    observation, _ = env.reset(seed=parts.randomness.environment)
+    observation, _ = env.reset(seed=parts.randomness.environment())
     stack.reset(observation)
     batch = parts.replay.sample(300, np.random.default_rng(0))
     for step in range(10):

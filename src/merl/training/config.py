@@ -20,6 +20,8 @@ Setting = Literal["matched", "published"]
 
 MOST_STEPS = 10**12
 """Far beyond what anyone will wait for."""
+MOST_ENVS = 1024
+"""Processes that one machine may bear."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,16 @@ class TrainConfig:
     """Updates for each environment step; below 1, an update every few steps."""
     action_repeat: int = 1
     """Environment steps for which an action is held; all steps here are environment steps."""
+    num_envs: int = 1
+    """Environments that act at the same time; more than one, each has a process of its own."""
+    synchronous: bool = True
+    """The learner waits for the environments' steps. If not (--no-synchronous), they act in
+    processes of their own while it learns, and an update does not know the newest step yet."""
+    worker_restarts: int = 10
+    """How often environments' processes are started again when one dies or does not answer, before
+    the run is saved and ended."""
+    worker_timeout: float = 30.0
+    """Seconds in which an environment's process has to answer."""
     save_every: float = 300.0
     """Seconds between checkpoints; each waits for the end of an episode."""
     keep: int = 2
@@ -96,18 +108,22 @@ class TrainConfig:
                 f"agent {self.agent_name!r} is made from a {kind.__name__}, not from a "
                 f"{type(self.agent).__name__}"
             )
-        for name in ("steps", "keep", "action_repeat"):
+        for name in ("steps", "keep", "action_repeat", "num_envs"):
             if not 1 <= getattr(self, name) <= MOST_STEPS:
                 raise MerlError(
                     f"{name.replace('_', '-')} must be at least 1 and at most {MOST_STEPS:,}, "
                     f"not {getattr(self, name)}"
                 )
-        for name in ("random_steps", "seed_steps", "seed"):
+        for name in ("random_steps", "seed_steps", "seed", "worker_restarts"):
             if getattr(self, name) < 0:
                 flag = name.replace("_", "-")
                 raise MerlError(f"{flag} must be at least 0, not {getattr(self, name)}")
         if self.minutes is not None and not self.minutes > 0:
             raise MerlError(f"minutes must be above 0, not {self.minutes}")
+        if not 0 < self.worker_timeout < math.inf:
+            raise MerlError(f"worker-timeout must be above 0 seconds, not {self.worker_timeout}")
+        if self.num_envs > MOST_ENVS:
+            raise MerlError(f"num-envs must be at most {MOST_ENVS}, not {self.num_envs}")
         if self.threads is not None and self.threads < 1:
             raise MerlError(f"threads must be at least 1, not {self.threads}")
         for name in ("updates_per_step", "save_every"):
@@ -125,6 +141,11 @@ class TrainConfig:
     def own_env(self) -> bool:
         """Whether the environment is the user's own, not one of merl's tasks."""
         return self.task not in ENV_IDS
+
+    @property
+    def has_workers(self) -> bool:
+        """Whether environments act in processes of their own."""
+        return self.num_envs > 1 or not self.synchronous
 
     @property
     def capacity(self) -> int:

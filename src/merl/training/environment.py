@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -77,6 +78,12 @@ def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
     except TypeError:
         return None
     return state
+
+
+def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any] | None) -> None:
+    """Have the environment's random numbers go on from what `environment_state` told."""
+    if state is not None:
+        env.unwrapped.np_random.bit_generator.state = state
 
 
 def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:

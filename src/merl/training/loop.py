@@ -10,17 +10,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from merl.core import Agent, Transition
-from merl.replay import Replay
+from merl.replay import Lanes
+from merl.training.acting import Environments, Lost
 from merl.training.config import TrainConfig
 from merl.training.guards import check_moment
-from merl.training.rollout import Episode, FrameStack
+from merl.training.rollout import Episode, FrameStack, side_by_side
 
 
 @dataclass
@@ -31,30 +31,32 @@ class Progress:
     updates: int = 0
     episodes: int = 0
     evaluated: int = 0  # the step of the last evaluation
+    restarts: int = 0  # of environments' processes
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What the loop tells after an environment step.
+    """What the loop tells after an environment step, or one step of each of several environments.
 
     Attributes:
         step: environment steps so far.
         updates: updates so far.
         learning: metrics of the updates at this step, scalars on the device; empty without one.
-        episode: the episode's sum, at its last step.
+        episodes: the sums of the episodes that ended with it.
+        lost: what happened to an environment's process; the episodes in progress are cut off.
     """
 
     step: int
     updates: int
     learning: dict[str, Tensor] = field(default_factory=dict)
-    episode: Episode | None = None
+    episodes: tuple[Episode, ...] = ()
+    lost: str | None = None
 
 
 class Randomness:
     """One seed, split by purpose: no use of one stream moves another.
 
     Attributes:
-        environment: the seed of the first reset; the environment goes on from there by itself.
         agent: the seed of initialisation, noise and shifts.
         actions: the uniformly random actions of the start.
         batches: what is sampled from replay.
@@ -62,8 +64,19 @@ class Randomness:
 
     def __init__(self, seed: int) -> None:
         words = np.random.SeedSequence(seed).generate_state(4)
-        self.environment, self.agent = int(words[0]), int(words[1])
+        self._seed, self._environment, self.agent = seed, int(words[0]), int(words[1])
         self.actions, self.batches = (np.random.default_rng(int(word)) for word in words[2:])
+
+    def environment(self, index: int = 0, restart: int = 0) -> int:
+        """The seed of an environment's first reset; it goes on from there by itself.
+
+        Args:
+            index: of the environment.
+            restart: how often it was made anew.
+        """
+        if index == restart == 0:
+            return self._environment
+        return int(np.random.SeedSequence((self._seed, index, restart)).generate_state(1)[0])
 
     def state_dict(self) -> dict[str, Any]:
         """The generators' states, as plain types."""
@@ -79,22 +92,14 @@ class Randomness:
 
 
 def train(
-    env: gymnasium.Env[Any, Any],
-    agent: Agent,
-    replay: Replay,
-    stack: FrameStack,
-    progress: Progress,
-    randomness: Randomness,
-    config: TrainConfig,
+    stage: Stage, agent: Agent, progress: Progress, randomness: Randomness, config: TrainConfig
 ) -> Iterator[Moment]:
-    """Act and learn until `config.steps`; yields after each environment step.
+    """Act and learn until `config.steps`; yields after each step of the environments.
 
     Args:
-        env: acts in [-1, 1], observes a `Dict`; reset with a seed by the caller's doing if the run
-            goes on from a checkpoint, by this loop if it begins.
+        stage: where the agent acts, and what remembers it; its environments are seeded by this loop
+            if the run begins, and stand where the caller set them if it goes on.
         agent: acts and learns.
-        replay: takes in every step.
-        stack: of the agent's frames.
         progress: moved on as the run goes.
         randomness: the run's random streams.
         config: steps, seed steps, random steps, updates per step, batch size.
@@ -102,37 +107,117 @@ def train(
     Raises:
         NotFinite: an observation or a reward is no number; the replay does not take it in.
     """
-    shape = env.action_space.shape
-    assert shape is not None
+    if progress.episodes == 0:
+        stage.seed(randomness, progress)
     while progress.step < config.steps:
-        seed = randomness.environment if progress.episodes == 0 else None
-        observation, _ = env.reset(seed=seed)
-        check_moment(observation, 0.0, progress.step)
-        replay.begin(observation)
-        stack.reset(observation)
-        episode, over = Episode(), False
-        while not over and progress.step < config.steps:
-            agent.step = progress.step
-            if progress.step < config.random_steps:
-                action = randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
-            else:
-                action = _first(agent.act(stack.observation(), explore=True))
-            observation, reward, terminated, truncated, info = env.step(action)
-            check_moment(observation, float(reward), progress.step + config.action_repeat)
-            over = bool(terminated or truncated)
-            discount = 0.0 if terminated else 1.0
-            replay.add(Transition(action, float(reward), discount, observation, over))
-            stack.push(observation)
-            episode.add(float(reward), info)
-            progress.step += config.action_repeat
-            learning = _learn(agent, replay, progress, randomness, config)
-            progress.episodes += over
-            yield Moment(progress.step, progress.updates, learning, episode if over else None)
+        agent.step = progress.step
+        learning: dict[str, Tensor] = {}
+        try:
+            stage.begin_episodes(randomness, progress)
+            stage.act(_actions(stage, agent, progress, randomness, config))
+            if not config.synchronous:  # while the environments step
+                learning = _learn(agent, stage.replay, progress, randomness, config)
+            ended = stage.remember(progress, config.action_repeat)
+        except Lost as lost:
+            stage.broken = True
+            yield Moment(progress.step, progress.updates, learning, lost=str(lost))
+            continue
+        if config.synchronous or progress.step >= config.steps:
+            learning = _learn(agent, stage.replay, progress, randomness, config) or learning
+        progress.episodes += len(ended)
+        yield Moment(progress.step, progress.updates, learning, ended)
+
+
+class Stage:
+    """The environments that the agent acts in, with the stacks that it sees, and the replay.
+
+    Args:
+        environments: one or several.
+        replay: a lane for each.
+        stacks: of each one's frames.
+
+    Attributes:
+        broken: an environment's process was lost; all are made anew before the next episode.
+    """
+
+    def __init__(self, environments: Environments, replay: Lanes, stacks: list[FrameStack]) -> None:
+        self.environments, self.replay, self.stacks = environments, replay, stacks
+        self.broken = False
+        self._seeds: dict[int, int] = {}
+        self._episodes: dict[int, Episode] = {}  # those in progress
+        self._actions: NDArray[np.float32] | None = None
+
+    @property
+    def count(self) -> int:
+        """How many environments there are."""
+        return self.environments.count
+
+    def seed(self, randomness: Randomness, progress: Progress) -> None:
+        """Have the next episode of each environment begin with a seed of the run's."""
+        self._seeds = {
+            index: randomness.environment(index, progress.restarts) for index in range(self.count)
+        }
+
+    def begin_episodes(self, randomness: Randomness, progress: Progress) -> None:
+        """Start an episode in every environment that is in none."""
+        if self.broken:
+            progress.restarts += 1
+            self._episodes.clear()  # the replay cuts them off where the next ones begin
+            self.environments.restart()
+            self.seed(randomness, progress)
+            self.broken = False
+        starting = {
+            index: self._seeds.pop(index, None)
+            for index in range(self.count)
+            if index not in self._episodes
+        }
+        if not starting:
+            return
+        for index, observation in self.environments.reset(starting).items():
+            check_moment(observation, 0.0, progress.step)
+            self.replay.lanes[index].begin(observation)
+            self.stacks[index].reset(observation)
+            self._episodes[index] = Episode()
+
+    def act(self, actions: NDArray[np.float32]) -> None:
+        """Have the environments step, with actions (count, A)."""
+        self._actions = actions
+        self.environments.send(actions)
+
+    def remember(self, progress: Progress, repeat: int) -> tuple[Episode, ...]:
+        """Take in what the actions led to; returns the episodes that it ended."""
+        assert self._actions is not None
+        ended = []
+        for index, step in enumerate(self.environments.receive()):
+            check_moment(step.observation, step.reward, progress.step + repeat)
+            over = bool(step.terminated or step.truncated)
+            discount = 0.0 if step.terminated else 1.0
+            self.replay.lanes[index].add(
+                Transition(self._actions[index], step.reward, discount, step.observation, over)
+            )
+            self.stacks[index].push(step.observation)
+            self._episodes[index].add(step.reward, step.info)
+            progress.step += repeat
+            if over:
+                ended.append(self._episodes.pop(index))
+        return tuple(ended)
+
+
+def _actions(
+    stage: Stage, agent: Agent, progress: Progress, randomness: Randomness, config: TrainConfig
+) -> NDArray[np.float32]:
+    """Uniformly random at first, then the agent's: (count, A) in [-1, 1]."""
+    if progress.step < config.random_steps:
+        shape = (stage.count, *stage.environments.action_shape)
+        return randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
+    actions = agent.act(side_by_side(stage.stacks), explore=True)
+    chosen: NDArray[np.float32] = actions.to("cpu", torch.float32).numpy()
+    return chosen
 
 
 def _learn(
     agent: Agent,
-    replay: Replay,
+    replay: Lanes,
     progress: Progress,
     randomness: Randomness,
     config: TrainConfig,
@@ -144,9 +229,3 @@ def _learn(
         metrics = agent.update(replay.sample(config.replay.batch_size, randomness.batches))
         progress.updates += 1
     return metrics
-
-
-def _first(actions: Tensor) -> NDArray[np.float32]:
-    """The action of a batch of one."""
-    first: NDArray[np.float32] = actions[0].to("cpu", torch.float32).numpy()
-    return first

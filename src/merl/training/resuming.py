@@ -12,6 +12,8 @@ from merl.training.config import TrainConfig
 HARMLESS = (
     "steps",
     "minutes",
+    "worker_restarts",
+    "worker_timeout",
     "save_every",
     "keep",
     "device",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,12 @@ class FrameStack:
         return {key: torch.from_numpy(v).to(self._device) for key, v in stacked.items()}
 
 
+def side_by_side(stacks: Sequence[FrameStack]) -> dict[str, torch.Tensor]:
+    """What several see, as one batch (N, ...)."""
+    seen = [stack.observation() for stack in stacks]
+    return seen[0] if len(seen) == 1 else {k: torch.cat([s[k] for s in seen]) for k in seen[0]}
+
+
 @dataclass
 class Episode:
     """What an episode came to, step by step.
@@ -84,3 +91,12 @@ class Episode:
                 "success_share": self.successes / self.length,
             }
         return values | {f"reward/{name}": value for name, value in self.terms.items()}
+
+
+def mean_metrics(episodes: Sequence[Episode]) -> dict[str, float]:
+    """The numbers of episodes that ended at the same step, in the mean."""
+    each = [episode.metrics() for episode in episodes]
+    return {
+        name: fmean(metrics[name] for metrics in each if name in metrics)
+        for name in dict.fromkeys(name for metrics in each for name in metrics)
+    }

@@ -8,7 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -19,19 +19,20 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
-from merl.core import MerlError, is_image
-from merl.replay import Replay, check_fits
+from merl.core import EnvironmentsLost, MerlError, is_image
+from merl.replay import Lanes, check_fits
 from merl.resources import available_memory, keep_freed_memory
 from merl.training import checkpoint
+from merl.training.acting import Environments, Here, Lost, Workers
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
-from merl.training.environment import environment_state, make_run_env, run_spaces
+from merl.training.environment import make_run_env, run_spaces
 from merl.training.evaluation import Evaluation, Policy, evaluate
 from merl.training.guards import LossGuard
-from merl.training.loop import Moment, Progress, Randomness, train
+from merl.training.loop import Moment, Progress, Randomness, Stage, train
 from merl.training.meters import Averages, Clock
 from merl.training.metrics import MetricsWriter
-from merl.training.rollout import FrameStack
+from merl.training.rollout import FrameStack, mean_metrics
 from merl.training.run import Run, refuse_existing, run_path, to_plain
 from merl.training.signals import Interrupt
 from merl.training.timing import measure
@@ -180,14 +181,18 @@ class Trainer:
         with ExitStack() as stack:
             interrupt = stack.enter_context(Interrupt().listening())
             metrics = stack.enter_context(MetricsWriter(run.path, view.warn))
-            replay = Replay(
-                self.config.replay,
+            config = self.config
+            replay = Lanes(
+                config.replay,
                 self.space,
                 self.action_space,
+                count=config.num_envs,
                 directory=run.replay,
-                capacity=self.config.capacity,
+                capacity=config.capacity,
             )
-            stretch = _Stretch(self, run, replay, metrics, view, interrupt)
+            environments = Workers(config, self.env) if config.has_workers else Here(self.env)
+            stack.callback(environments.close)
+            stretch = _Stretch(self, run, replay, environments, metrics, view, interrupt)
             if start is not None:
                 stretch.restore(start)
                 run.record_resumption(start.step)
@@ -205,26 +210,34 @@ class _Stretch:
         self,
         trainer: Trainer,
         run: Run,
-        replay: Replay,
+        replay: Lanes,
+        environments: Environments,
         metrics: MetricsWriter,
         view: View,
         interrupt: Interrupt,
     ) -> None:
         self.trainer, self.config, self.run = trainer, trainer.config, run
-        self.replay, self.metrics, self.view, self.interrupt = replay, metrics, view, interrupt
+        self.replay, self.environments = replay, environments
+        self.metrics, self.view, self.interrupt = metrics, view, interrupt
         self.clock, self.averages, self.guard = Clock(), Averages(), LossGuard()
         self.evaluation: Evaluation | None = None
+        self.losses = 0
+        self._states: list[dict[str, Any] | None] = [None] * environments.count
         self._saved = time.perf_counter()
 
     def train(self) -> Outcome:
         """Drive the loop; between its steps log, evaluate, save, and see whether to stop."""
         trainer, progress = self.trainer, self.trainer.progress
         images = tuple(key for key in trainer.space if is_image(trainer.space[key]))
-        frames = FrameStack(self.config.replay.frame_stack, images, trainer.device)
+        stacks = [
+            FrameStack(self.config.replay.frame_stack, images, trainer.device)
+            for _ in range(self.environments.count)
+        ]
+        stage = Stage(self.environments, self.replay, stacks)
         self.view.begin(self.run, trainer)
         if not trainer.films and self.config.eval.video != "none":
             self.view.warn("there will be no videos: the environment does not render to an array")
-        if environment_state(trainer.env) is None:
+        if None in self.environments.states():
             self.view.warn(
                 "a resumed run will meet other episodes than this one would: the environment does "
                 "not draw from Gymnasium's np_random"
@@ -232,19 +245,13 @@ class _Stretch:
         if progress.step == 0:
             self._save()  # from here on there is something to go on from
         self.clock.mark(progress)
-        for moment in train(
-            trainer.env,
-            trainer.agent,
-            self.replay,
-            frames,
-            progress,
-            trainer.randomness,
-            self.config,
-        ):
+        for moment in train(stage, trainer.agent, progress, trainer.randomness, self.config):
             self.guard.watch(moment.learning, moment.step)
             self.averages.add(moment.learning)
-            self.view.moment(moment, self._log(moment) if moment.episode else {})
-            if moment.episode and not self._is_to_stop():
+            if moment.lost and not self._is_to_stop():
+                self._lost(moment.lost)
+            self.view.moment(moment, self._log(moment) if moment.episodes else {})
+            if moment.episodes and not self._is_to_stop():
                 self._at_episode_end()
             if self._is_to_stop():
                 break
@@ -260,10 +267,29 @@ class _Stretch:
         trainer.progress = Progress(**state["progress"])
         trainer.randomness.load_state_dict(state["randomness"])
         self.replay.load_state_dict(state["replay"])
-        if state["environment"] is not None:
-            trainer.env.unwrapped.np_random.bit_generator.state = state["environment"]
+        states = state["environment"]
+        self.environments.restore(states if isinstance(states, list) else [states])
         self.clock = Clock(state["seconds"], state["cpu_seconds"])
         self.metrics.trim(trainer.progress.step)
+
+    def _lost(self, what: str) -> None:
+        """An environment's process was lost: they are started again, if not too often.
+
+        Raises:
+            EnvironmentsLost: too often; the run is saved.
+        """
+        self.losses += 1
+        most = self.config.worker_restarts
+        if self.losses > most:
+            self._save()
+            raise EnvironmentsLost(
+                f"an environment's process {what}, after {most} restarts: the run is saved at step "
+                f"{self.trainer.progress.step:,}; go on with `merl resume {self.run.path}`"
+            )
+        self.view.warn(
+            f"an environment's process {what}: starting the environments again ({self.losses} of "
+            f"{most} times)"
+        )
 
     def _is_to_stop(self) -> bool:
         """By a signal, or because the minutes of this stretch are over."""
@@ -282,13 +308,14 @@ class _Stretch:
 
     def _log(self, moment: Moment) -> dict[str, float]:
         """A row of metrics for the episode that has ended."""
-        assert moment.episode is not None
         self.guard.check()
         self.run.check_there()
-        values = {f"train/{k}": v for k, v in moment.episode.metrics().items()}
+        values = {f"train/{k}": v for k, v in mean_metrics(moment.episodes).items()}
         values |= self.averages.take()
         values |= self.clock.rates(self.trainer.progress)
         values["replay/steps"] = float(len(self.replay))
+        if self.config.has_workers:
+            values["workers/restarts"] = float(self.trainer.progress.restarts)
         self.metrics.write(moment.step, values)
         return values
 
@@ -322,6 +349,12 @@ class _Stretch:
             raise _Interrupted
         self.view.evaluating(episode, self.config.eval.episodes)
 
+    def _environment_states(self) -> list[dict[str, Any] | None]:
+        """Where the environments stand; of those that are lost, where they stood last."""
+        with suppress(Lost):
+            self._states = self.environments.states()
+        return self._states
+
     def _save(self) -> bool:
         """Write a checkpoint; that it could not be written is told, and does not stop the run.
 
@@ -336,7 +369,7 @@ class _Stretch:
             "progress": dataclasses.asdict(progress),
             "randomness": trainer.randomness.state_dict(),
             "replay": self.replay.state_dict(),
-            "environment": environment_state(trainer.env),
+            "environment": self._environment_states(),
             "seconds": self.clock.seconds(),
             "cpu_seconds": self.clock.cpu_seconds(),
             "env": to_plain(self.config.env),

@@ -1,0 +1,128 @@
+"""Several environments fill the replay at once: a ring for each, sampled as one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from torch import Tensor
+
+from merl.core import Batch
+from merl.replay.config import ReplayConfig
+from merl.replay.ring import Replay
+
+
+class Lanes:
+    """A ring for each environment, so that episodes that grow side by side stay in one piece.
+
+    Every step that any of them holds is sampled with the same probability.
+
+    Args:
+        config: what is kept and how it is sampled.
+        observation_space: see `Replay`.
+        action_space: see `Replay`.
+        count: of environments.
+        directory: where the rings lie; one alone lies there itself, several in folders 0, 1, ...
+        capacity: steps that are kept in all, in place of the config's.
+
+    Attributes:
+        lanes: the rings, in the environments' order.
+
+    Raises:
+        MerlError: see `Replay`.
+    """
+
+    def __init__(
+        self,
+        config: ReplayConfig,
+        observation_space: gymnasium.spaces.Dict,
+        action_space: gymnasium.spaces.Box,
+        *,
+        count: int = 1,
+        directory: Path | None = None,
+        capacity: int | None = None,
+    ) -> None:
+        whole = config.capacity if capacity is None else capacity
+        each = max(math.ceil(whole / count), config.batch_size)
+        self.lanes = [
+            Replay(
+                config,
+                observation_space,
+                action_space,
+                directory=directory if directory is None or count == 1 else directory / str(index),
+                capacity=each,
+            )
+            for index in range(count)
+        ]
+
+    def __len__(self) -> int:
+        """Steps that can be sampled now."""
+        return sum(len(lane) for lane in self.lanes)
+
+    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+        """Draw steps uniformly, with replacement; those of one lane lie side by side.
+
+        Returns:
+            Tensors on the CPU that are the caller's own; shapes as in `merl.core.Batch`.
+
+        Raises:
+            ValueError: no step is held yet.
+        """
+        if len(self.lanes) == 1 or not len(self):
+            return self.lanes[0].sample(batch_size, rng)
+        shares = np.array([len(lane) for lane in self.lanes]) / len(self)
+        counts = rng.multinomial(batch_size, shares)
+        return _joined(
+            [
+                lane.sample(int(count), rng)
+                for lane, count in zip(self.lanes, counts, strict=True)
+                if count
+            ]
+        )
+
+    def flush(self) -> None:
+        """Have everything written reach the disk; returns when it has."""
+        for lane in self.lanes:
+            lane.flush()
+
+    def settle(self) -> None:
+        """A checkpoint of the present state is on the disk: no older one is to be gone back to."""
+        for lane in self.lanes:
+            lane.settle()
+
+    def state_dict(self) -> dict[str, Any]:
+        """As `Replay.state_dict`; of several lanes theirs, and whether any is in an episode."""
+        states: list[dict[str, Any]] = [lane.state_dict() for lane in self.lanes]
+        if len(states) == 1:
+            return states[0]
+        return {"lanes": states, "open": any(state["open"] for state in states)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go back to what `state_dict` said; see `Replay.load_state_dict`.
+
+        Raises:
+            MerlError: a ring does not hold what the state names.
+        """
+        for lane, its in zip(self.lanes, state.get("lanes", [state]), strict=True):
+            lane.load_state_dict(its)
+
+
+def _joined(batches: list[Batch]) -> Batch:
+    if len(batches) == 1:
+        return batches[0]
+
+    def observation(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+        return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+
+    return Batch(
+        observation([batch.observation for batch in batches]),
+        torch.cat([batch.action for batch in batches]),
+        torch.cat([batch.reward for batch in batches]),
+        torch.cat([batch.discount for batch in batches]),
+        observation([batch.next_observation for batch in batches]),
+    )

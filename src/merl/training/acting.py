@@ -1,0 +1,327 @@
+"""Where the agent acts: an environment in this process, or several in processes of their own.
+
+Both are spoken to in the same way: `send` actions, `receive` what they led to. In between,
+environments in processes of their own step while the learner learns.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from threading import Timer
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from numpy.typing import NDArray
+
+from merl.core import EnvironmentsLost, Observation
+from merl.training.config import TrainConfig
+from merl.training.environment import environment_state, make_run_env, set_environment_state
+
+_INFO = ("success", "reward_terms")
+"""What the loop wants to know beside the reward."""
+
+
+START_SECONDS = 300.0
+"""In which all processes must have made their environments."""
+END_SECONDS = 5.0
+"""In which they must have ended, before they are killed."""
+
+
+class Step(NamedTuple):
+    """What an action led to; see `gymnasium.Env.step`."""
+
+    observation: Observation
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: Mapping[str, Any]
+
+
+class Lost(Exception):  # noqa: N818 (no error as long as it can be mended)
+    """A process of an environment died or does not answer: the episodes in progress are lost."""
+
+
+class Environments(Protocol):
+    """One environment or several, that are stepped together.
+
+    Attributes:
+        count: how many there are.
+        action_shape: of one action, (A,).
+    """
+
+    count: int
+    action_shape: tuple[int, ...]
+
+    def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
+        """Start an episode in each environment named, with its seed if it has one.
+
+        Raises:
+            Lost: a process died.
+        """
+        ...
+
+    def send(self, actions: NDArray[np.float32]) -> None:
+        """Have every environment take its action, (count, A) in [-1, 1].
+
+        Raises:
+            Lost: a process died.
+        """
+        ...
+
+    def receive(self) -> list[Step]:
+        """What the actions led to, once they all have.
+
+        Raises:
+            Lost: a process died, or is late.
+        """
+        ...
+
+    def states(self) -> list[dict[str, Any] | None]:
+        """Where each one's random numbers stand, as plain types; None if it does not tell."""
+        ...
+
+    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        """Take back what `states` gave."""
+        ...
+
+    def restart(self) -> None:
+        """Make them anew, after one was lost.
+
+        Raises:
+            Lost: they cannot be started.
+        """
+        ...
+
+    def close(self) -> None:
+        """End them."""
+        ...
+
+
+class Here:
+    """One environment in this process: nothing happens between `send` and `receive`.
+
+    Args:
+        env: the environment; who made it closes it.
+    """
+
+    count = 1
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        self._env = env
+        self.action_shape = env.action_space.shape or ()
+        self._action: NDArray[np.float32] | None = None
+
+    def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
+        """See `Environments`."""
+        return {index: self._env.reset(seed=seed)[0] for index, seed in seeds.items()}
+
+    def send(self, actions: NDArray[np.float32]) -> None:
+        """See `Environments`."""
+        self._action = actions[0]
+
+    def receive(self) -> list[Step]:
+        """See `Environments`."""
+        observation, reward, terminated, truncated, info = self._env.step(self._action)
+        return [Step(observation, float(reward), terminated, truncated, info)]
+
+    def states(self) -> list[dict[str, Any] | None]:
+        """See `Environments`."""
+        return [environment_state(self._env)]
+
+    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        """See `Environments`."""
+        set_environment_state(self._env, states[0])
+
+    def restart(self) -> None:
+        """See `Environments`; it is never lost."""
+
+    def close(self) -> None:
+        """See `Environments`."""
+
+
+class Workers:
+    """Environments in processes of their own, which step at the same time.
+
+    They are spawned (a fork with OpenGL or with threads hangs), give their observations through
+    shared memory, and end with this process. When one of them dies, or does not answer in time, all
+    are started again by `restart`.
+
+    Args:
+        config: of the run; `num_envs`, and `worker_timeout` in seconds.
+        here: the same environment in this process, which lends its spaces and stays as it is.
+
+    Raises:
+        EnvironmentsLost: they cannot be started.
+    """
+
+    def __init__(self, config: TrainConfig, here: gymnasium.Env[Any, Any]) -> None:
+        self.count, self.action_shape = config.num_envs, here.action_space.shape or ()
+        self._config, self._here, self._timeout = config, here, config.worker_timeout
+        self._lost: str | None = None  # what became of a process
+        try:
+            self._env = self._started()
+        except Lost as lost:
+            raise EnvironmentsLost(
+                f"an environment's process {lost} while it was started: see what it said above"
+            ) from None
+
+    def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
+        """See `Environments`."""
+        which = np.array([index in seeds for index in range(self.count)])
+        with self._loss():
+            self._env.reset_async(
+                [seeds.get(index) for index in range(self.count)], {"reset_mask": which}
+            )
+            observations, _ = self._env.reset_wait(self._timeout)
+        return {index: _nth(observations, index) for index in seeds}
+
+    def send(self, actions: NDArray[np.float32]) -> None:
+        """See `Environments`."""
+        with self._loss():
+            self._env.step_async(actions)
+
+    def receive(self) -> list[Step]:
+        """See `Environments`."""
+        with self._loss():
+            observations, rewards, terminated, truncated, infos = self._env.step_wait(self._timeout)
+        return [
+            Step(
+                _nth(observations, index),
+                float(rewards[index]),
+                bool(terminated[index]),
+                bool(truncated[index]),
+                _nth(infos, index),
+            )
+            for index in range(self.count)
+        ]
+
+    def states(self) -> list[dict[str, Any] | None]:
+        """See `Environments`."""
+        return [*self._call("state")]
+
+    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        """See `Environments`."""
+        self._call("restore", list(states))
+
+    def restart(self) -> None:
+        """See `Environments`."""
+        self.close()
+        self._env = self._started()
+
+    def close(self) -> None:
+        """See `Environments`."""
+        _end(self._env)
+
+    @contextmanager
+    def _loss(self) -> Iterator[None]:
+        """What is left of a process that has gone, as `Lost`; nothing is asked until a restart."""
+        if self._lost is not None:
+            raise Lost(self._lost)
+        try:
+            yield
+        except multiprocessing.TimeoutError:
+            self._lost = "did not answer in time"
+        except (EOFError, ConnectionError):
+            self._lost = "died"
+        if self._lost is not None:
+            raise Lost(self._lost)
+
+    def _call(self, name: str, *args: Any) -> tuple[Any, ...]:
+        with self._loss():
+            self._env.call_async(name, *args)
+            return self._env.call_wait(self._timeout)
+
+    def _started(self) -> AsyncVectorEnv:
+        self._lost = None
+        makers = [_Maker(self._config, index, self._here) for index in range(self.count)]
+        with self._loss(), _killing_after(START_SECONDS):
+            return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+
+
+@contextmanager
+def _killing_after(seconds: float) -> Iterator[None]:
+    """Kill every process of this one's if the work takes longer: whoever waits for them goes on."""
+    impatience = Timer(seconds, _kill)
+    impatience.daemon = True
+    impatience.start()
+    try:
+        yield
+    finally:
+        impatience.cancel()
+
+
+def _kill() -> None:
+    for process in multiprocessing.active_children():
+        process.kill()
+
+
+def _end(env: AsyncVectorEnv) -> None:
+    """End the processes, whatever state they are in."""
+    with _killing_after(END_SECONDS):
+        try:
+            env.close()
+        except Exception:  # a pipe or a process is gone: no way to end in good order
+            _kill()
+            with suppress(Exception):
+                env.close(terminate=True)
+
+
+def _nth(batch: Mapping[str, Any], index: int) -> dict[str, Any]:
+    """One environment's part of a batched observation or info."""
+    return {
+        key: _nth(value, index) if isinstance(value, Mapping) else value[index]
+        for key, value in batch.items()
+        if not key.startswith("_")  # Gymnasium's marks of who gave an info
+    }
+
+
+class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment in a process of its own, with what the loop asks of it beside stepping."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], index: int) -> None:
+        super().__init__(env)
+        self._index = index
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        observation, _ = self.env.reset(**options)
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        told = {name: info[name] for name in _INFO if name in info}
+        return observation, reward, terminated, truncated, told
+
+    def state(self) -> dict[str, Any] | None:
+        return environment_state(self.env)
+
+    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        set_environment_state(self.env, states[self._index])
+
+
+class _Lent(gymnasium.Env[Any, Any]):
+    """The spaces of an environment, for who wants to make one only to look at it."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+
+
+@dataclass
+class _Maker:
+    """Makes an environment in the process that it is sent to."""
+
+    config: TrainConfig
+    index: int
+    here: gymnasium.Env[Any, Any] | None
+
+    def __call__(self) -> gymnasium.Env[Any, Any]:
+        if self.here is not None:
+            return _Lent(self.here)
+        return _Worker(make_run_env(self.config), self.index)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"config": self.config, "index": self.index, "here": None}

@@ -188,3 +188,18 @@ def test_the_same_line_begins_goes_on_and_is_done(
     shutil.rmtree(folder / "checkpoints")
     assert main(line(folder, "--resume", "--steps", "400")) == 2
     assert "no whole checkpoint" in capsys.readouterr().err
+
+
+def test_a_soak_for_half_a_minute(tmp_path: Path) -> None:
+    """`docs/measure_soak.py` goes on for two hours."""
+    flags = [*line(tmp_path)[2:-4], "--updates-per-step", "0.1"]  # neither --steps nor --run-dir
+    script = Path(__file__).parents[1] / "docs" / "measure_soak.py"
+    rows = tmp_path / "soak.csv"
+    command = [sys.executable, script, "--minutes", "0.5", "--least", "9", "--most", "14"]
+    command += ["--task", "merl.envs.dot:whole", "--output", rows, f"--flags={' '.join(flags)}"]
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr
+    values = np.loadtxt(rows, delimiter=",", skiprows=1)
+    assert len(values) >= 2
+    assert values[-1, 1] > values[0, 1] > 0
+    assert (values[:, 2] <= EPISODE).all()

@@ -7,11 +7,12 @@ from typing import Any
 
 from rich.console import RenderableType
 
-from merl.bench import env, replay, update
+from merl.bench import env, replay, train, update
 
 BENCHES: dict[str, tuple[Callable[..., dict[str, Any]], Callable[[Any], RenderableType]]] = {
     "update": (update.run, update.table),
     "env": (env.run, env.table),
     "replay": (replay.run, replay.table),
+    "train": (train.run, train.table),
 }
 """Name to the measurement and to how its result is shown."""

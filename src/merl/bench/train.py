@@ -1,0 +1,133 @@
+"""The whole loop: acting, replay and updates, one after another or at the same time.
+
+Every way to run it is a loop of its own with its own agent and replay; they take turns of some
+steps each. What counts is the ratio to the strict loop within a round.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from contextlib import ExitStack
+from typing import Any
+
+import torch
+from rich.table import Table
+
+from merl.agents import make_agent
+from merl.bench.measuring import circumstances, shown, spread
+from merl.core import is_image
+from merl.experiments.presets import compose
+from merl.replay import Lanes
+from merl.training.acting import Environments, Here, Workers
+from merl.training.config import TrainConfig
+from merl.training.environment import make_run_env, run_spaces
+from merl.training.loop import Progress, Randomness, Stage, train
+from merl.training.rollout import FrameStack
+from merl.training.timing import measure
+
+STRICT = "strict: one environment, in turn with the learner"
+WARM_UP = 100
+"""Steps of every side before its first update."""
+CAPACITY = 10_000
+"""Steps that a replay keeps."""
+
+
+def run(
+    repeats: int = 5, steps: int = 60, task: str = "reach_duplo", preset: str = "laptop"
+) -> dict[str, Any]:
+    """Time the loop, with updates from the start.
+
+    Args:
+        repeats: how many rounds, in each of which every side has its turn.
+        steps: environment steps of a turn.
+        task: what is trained on.
+        preset: whose values.
+
+    Returns:
+        Plain values: `steps_per_s` by side and `ratio` to the strict loop, each as `median`, `low`
+        and `high` over the rounds; `precision`, `threads` and `updates_per_step`.
+    """
+    config = dataclasses.replace(compose(preset, task), random_steps=WARM_UP, seed_steps=WARM_UP)
+    result: dict[str, Any] = {"repeats": repeats, "steps": steps, "task": task, "preset": preset}
+    result |= {"updates_per_step": config.updates_per_step} | circumstances()
+    with ExitStack() as stack:
+        env = make_run_env(config)
+        stack.callback(env.close)
+        space, _ = run_spaces(config, env)
+        best = measure(config, env, env, space, torch.device("cpu")).best
+        agent = dataclasses.replace(config.agent, precision=best.precision)
+        config = dataclasses.replace(config, agent=agent, threads=best.threads)
+        result |= {"precision": best.precision, "threads": best.threads}
+        torch.set_num_threads(best.threads)
+        loops = {
+            side: _Loop(dataclasses.replace(config, **asked), stack)
+            for side, asked in _sides().items()
+        }
+        for loop in loops.values():
+            loop.rate(WARM_UP + steps)
+        rates: dict[str, list[float]] = {side: [] for side in loops}
+        for _ in range(repeats):
+            for side, loop in loops.items():
+                rates[side].append(loop.rate(steps))
+    result["steps_per_s"] = {side: spread(values) for side, values in rates.items()}
+    result["ratio"] = {
+        side: spread([a / b for a, b in zip(values, rates[STRICT], strict=True)])
+        for side, values in rates.items()
+    }
+    return result
+
+
+def table(result: dict[str, Any]) -> Table:
+    """What `run` returned, for people."""
+    rows = Table(
+        title=f"{result['task']}, preset {result['preset']}, {result['updates_per_step']:g} updates a step in "
+        f"{result['precision']} on {result['threads']} threads, median of {result['repeats']} "
+        "(least to most)"
+    )
+    for heading in ("", "steps/s", "to the strict loop"):
+        rows.add_column(heading, justify="right" if heading else "left")
+    for side, rate in result["steps_per_s"].items():
+        rows.add_row(side, shown(rate), shown(result["ratio"][side]))
+    return rows
+
+
+def _sides() -> dict[str, dict[str, Any]]:
+    """The ways to run the loop, by what they are called."""
+    several = max(2, len(os.sched_getaffinity(0)) - 1)
+    return {
+        STRICT: {},
+        "one environment, beside the learner": {"synchronous": False},
+        f"{several} environments, beside the learner": {
+            "synchronous": False,
+            "num_envs": several,
+        },
+    }
+
+
+class _Loop:
+    """One way to run it, that can be stopped and gone on with at every step."""
+
+    def __init__(self, config: TrainConfig, stack: ExitStack) -> None:
+        env = make_run_env(config)
+        stack.callback(env.close)
+        space, actions = run_spaces(config, env)
+        environments: Environments = Workers(config, env) if config.has_workers else Here(env)
+        stack.callback(environments.close)
+        device, frames = torch.device("cpu"), config.replay.frame_stack
+        images = tuple(key for key in space if is_image(space[key]))
+        count = environments.count
+        replay = Lanes(config.replay, space, actions, count=count, capacity=CAPACITY)
+        stacks = [FrameStack(frames, images, device) for _ in range(count)]
+        agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)
+        self._progress = Progress()
+        stage = Stage(environments, replay, stacks)
+        self._moments = train(stage, agent, self._progress, Randomness(config.seed), config)
+
+    def rate(self, steps: int) -> float:
+        """Go on by so many steps, or a few more; returns steps per second."""
+        first, begun = self._progress.step, time.perf_counter()
+        while self._progress.step < first + steps:
+            next(self._moments)
+        return (self._progress.step - first) / (time.perf_counter() - begun)

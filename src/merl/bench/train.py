@@ -82,7 +82,8 @@ def run(
 def table(result: dict[str, Any]) -> Table:
     """What `run` returned, for people."""
     rows = Table(
-        title=f"{result['task']}, preset {result['preset']}, {result['updates_per_step']:g} updates a step in "
+        title=f"{result['task']}, preset {result['preset']}, "
+        f"{result['updates_per_step']:g} updates a step in "
         f"{result['precision']} on {result['threads']} threads, median of {result['repeats']} "
         "(least to most)"
     )

@@ -27,7 +27,9 @@ def main() -> None:
             "move_box, margin of the goal 0.2 m": DOCS
             / "data"
             / "state-move_box-margin20-seed0.csv",
+            "move_box, goal linear to 0.3 m": DOCS / "data" / "state-move_box-linear30-seed0.csv",
             "lift_box": DOCS / "data" / "state-lift_box-seed0.csv",
+            "lift_box, goal linear to 0.3 m": DOCS / "data" / "state-lift_box-linear30-seed0.csv",
         },
         DOCS / "images" / "state.png",
     )

@@ -48,4 +48,4 @@ def test_bench_refuses_what_cannot_be(capsys: pytest.CaptureFixture[str]) -> Non
     assert main(["bench", "env", "--repeats", "0"]) == 2
     assert "--repeats must be at least 1" in capsys.readouterr().err
     assert main(["bench"]) == 0
-    assert "usage: merl bench {update,env,replay}" in capsys.readouterr().out
+    assert "usage: merl bench {update,env,replay,train}" in capsys.readouterr().out

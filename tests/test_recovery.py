@@ -192,7 +192,8 @@ def test_the_same_line_begins_goes_on_and_is_done(
 
 def test_a_soak_for_half_a_minute(tmp_path: Path) -> None:
     """`docs/measure_soak.py` goes on for two hours."""
-    flags = [*line(tmp_path)[2:-4], "--updates-per-step", "0.1"]  # neither --steps nor --run-dir
+    without_end = ["--steps", "100000000", "--updates-per-step", "0.1"]
+    flags = [*line(tmp_path)[2:-4], *without_end]  # the script says --run-dir
     script = Path(__file__).parents[1] / "docs" / "measure_soak.py"
     rows = tmp_path / "soak.csv"
     command = [sys.executable, script, "--minutes", "0.5", "--least", "9", "--most", "14"]

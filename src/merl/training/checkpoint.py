@@ -137,7 +137,7 @@ def save(
     """
     learnt = agent.state_dict()
     check_weights({group: learnt[group] for group in _WEIGHT_GROUPS})
-    root.mkdir(parents=True, exist_ok=True)
+    root.mkdir(exist_ok=True)  # no parents: a run's folder that was taken away stays away
     part = root / f".part-{step:08d}"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()

@@ -56,6 +56,8 @@ class MetricsWriter:
         self._tail = 0  # byte at which the last row's line begins
         self._file: io.FileIO | None = None  # None: the file is behind memory, rewrite it whole
         self._events: _EventFile | None = None
+        # Only here: a folder that is taken away during the run stays away.
+        self._guard(lambda: self._path.parent.mkdir(parents=True, exist_ok=True))
         self._guard(lambda: self._rewrite(None))
         self._guard(self._open_events)
 
@@ -186,7 +188,6 @@ class MetricsWriter:
         """Write every row to a temporary file, put it in place of `metrics.csv`, and open that."""
         if old is not None:
             old.close()
-        self._path.parent.mkdir(parents=True, exist_ok=True)
         lines = [_csv_line(self._columns), *(_csv_line(self._cells(row)) for row in self._rows)]
         temporary = self._path.with_name(f".{self._path.name}.part")
         try:
@@ -237,7 +238,7 @@ class _EventFile:
         self._event_pb2: Any = event_pb2
         self._summary_pb2: Any = summary_pb2
         self._record_writer: Any = RecordWriter
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(exist_ok=True)
         # The order of names is the order in which TensorBoard reads them, so time comes first.
         stamp = f"{time.time_ns() / 1e9:020.9f}.{socket.gethostname()}.{os.getpid()}"
         self._file = io.FileIO(folder / f"events.out.tfevents.{stamp}", "w")

@@ -320,6 +320,7 @@ class _Stretch:
         return values
 
     def _evaluate(self, last: bool = False) -> None:
+        self.run.check_there()
         trainer, config = self.trainer, self.config.eval
         step = trainer.progress.step
         policy = Policy(trainer.agent, self.config, trainer.space, trainer.device, step)
@@ -385,6 +386,7 @@ class _Stretch:
                 keep=self.config.keep,
             )
         except OSError as error:
+            self.run.check_there()
             reason = error.strerror or error
             self.view.warn(f"the checkpoint at step {progress.step} was not written: {reason}")
             return False

@@ -8,7 +8,7 @@ from dm_control import composer
 
 from episodes import Episodes, check_starts, check_uniform
 from merl.core import MerlError
-from merl.tasks import OCCLUDED, TASKS, jaco, make_task, rewards
+from merl.tasks import AROUND, OCCLUDED, TASKS, jaco, make_task, rewards
 from merl.tasks.box import BOX_HALF_SIZE, BOX_MASS
 
 BOX_TASKS = [("move_box", False), ("lift_box", False), ("move_box", True), ("lift_box", True)]
@@ -200,3 +200,29 @@ def test_tasks_by_name():
         make_task("move_boxes")
     with pytest.raises(MerlError, match="reach_duplo has no occluded form: choose from move_box"):
         make_task("reach_duplo", occluded=True)
+    with pytest.raises(MerlError, match="start above"):
+        make_task("reach_duplo", start="around")
+    with pytest.raises(MerlError, match="occluded needs start above"):
+        make_task("lift_box", occluded=True, start="around")
+
+
+@pytest.mark.parametrize("name", AROUND)
+def test_the_hand_can_start_around_the_box_and_touches_nothing(name):
+    episodes, above = Episodes(name, start="around"), Episodes(name)
+    task, offsets, velocities = episodes.task, [], []
+    for seed in range(50):
+        physics = episodes.start(seed)
+        prop = task.prop_position(physics)
+        np.testing.assert_array_equal(prop, above.task.prop_position(above.start(seed)))
+        offsets.append(task.tool_center_point(physics) - prop)
+        velocities.append(np.abs(physics.data.qvel).max())
+        assert task.tilt_cosine(physics) > 0.99
+        robot = set(physics.bind(task.arm.mjcf_model.find_all("geom")).element_id)
+        for contact in physics.data.contact:
+            pair = {contact.geom1, contact.geom2}
+            assert contact.dist > 0 or not pair & robot or pair <= robot
+    lower, upper = np.array(jaco.AROUND_OBJECT)
+    assert (np.array(offsets) >= lower - 1e-3).all()
+    assert (np.array(offsets) <= upper + 1e-3).all()
+    assert (np.std(offsets, axis=0) > 0.003).all()
+    assert max(velocities) < 1e-3

@@ -10,6 +10,7 @@ from merl.core import MerlError, check_choice
 RendererName = Literal["gl", "warp"]
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
+StartName = Literal["above", "around"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 
@@ -40,6 +41,10 @@ class EnvConfig:
     """Put a disc between camera and object, for `move_box` and `lift_box`: what the camera does not
     see, the joints have to tell."""
 
+    start: StartName = "above"
+    """Where the hand starts: `above` (20 to 40 cm over the floor) or, for `move_box` and
+    `lift_box`, `around` (its open fingers around the box: the tasks without the way to it)."""
+
     render_size: int = 480
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
 
@@ -47,6 +52,7 @@ class EnvConfig:
         check_choice("renderer", self.renderer, get_args(RendererName))
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
+        check_choice("start", self.start, get_args(StartName))
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
                 f"observations is {self.observations!r}: give a tuple of at least one of "

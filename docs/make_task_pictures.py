@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from merl.envs import make_env
 from merl.envs.config import RendererName
-from merl.tasks import OCCLUDED, TASKS
+from merl.tasks import BOX_TASKS, TASKS
 
 OUTPUT = Path(__file__).parent / "images" / "tasks.png"
 SEED, SIZE = 3, 240
@@ -33,7 +33,7 @@ def picture(task: str, renderer: RendererName, occluded: bool, size: int) -> NDA
 
 def main() -> None:
     """Draw a row for each task and each occluded form."""
-    rows = [(task, False) for task in TASKS] + [(task, True) for task in OCCLUDED]
+    rows = [(task, False) for task in TASKS] + [(task, True) for task in BOX_TASKS]
     figure = Figure(figsize=(3.0 * 3, 3.0 * len(rows)), dpi=80, layout="constrained")
     for (task, occluded), panels in zip(rows, figure.subplots(len(rows), 3), strict=True):
         gl, warp = (picture(task, name, occluded, SIZE) for name in ("gl", "warp"))

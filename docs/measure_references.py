@@ -16,8 +16,7 @@ import numpy as np
 from merl.envs import make_env
 from merl.envs.expert import ExpertPolicy
 from merl.report.references import OCCLUDED
-from merl.tasks import OCCLUDED as OCCLUDED_TASKS
-from merl.tasks import TASKS
+from merl.tasks import BOX_TASKS, TASKS
 from merl.training.evaluation import Evaluation, evaluate
 
 OUTPUT = Path(__file__).parent.parent / "src/merl/report/references.json"
@@ -70,5 +69,5 @@ def row(name: str, result: Evaluation) -> dict[str, object]:
 if __name__ == "__main__":
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     table = {task: measure(task, False, count) + PUBLISHED.get(task, []) for task in TASKS}
-    table |= {task + OCCLUDED: measure(task, True, count) for task in OCCLUDED_TASKS}
+    table |= {task + OCCLUDED: measure(task, True, count) for task in BOX_TASKS}
     OUTPUT.write_text(json.dumps(table, indent=1) + "\n")

@@ -8,9 +8,9 @@ from merl.tasks import jaco, make_task
 class Episodes:
     """A task, started in the way of `JacoEnv`: one physics for all episodes."""
 
-    def __init__(self, name, occluded=False, start="above"):
+    def __init__(self, name, occluded=False, starts=jaco.ABOVE):
         self.name, self.occluded = name, occluded
-        self.task = make_task(name, occluded=occluded, start=start)
+        self.task = make_task(name, occluded=occluded, starts=starts)
         self.physics = self.task.compile()
 
     def start(self, seed):

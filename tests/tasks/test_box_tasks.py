@@ -8,13 +8,15 @@ from dm_control import composer
 
 from episodes import Episodes, check_starts, check_uniform
 from merl.core import MerlError
-from merl.tasks import AROUND, OCCLUDED, TASKS, jaco, make_task, rewards
+from merl.tasks import BOX_TASKS, TASKS, jaco, make_task, rewards
 from merl.tasks.box import BOX_HALF_SIZE, BOX_MASS
+from merl.tasks.expert import GRIP, Expert
+from merl.tasks.kinematics import Pose
 
-BOX_TASKS = [("move_box", False), ("lift_box", False), ("move_box", True), ("lift_box", True)]
+FORMS = [("move_box", False), ("lift_box", False), ("move_box", True), ("lift_box", True)]
 
 
-@pytest.fixture(scope="module", params=BOX_TASKS, ids=lambda p: p[0] + "-occluded" * p[1])
+@pytest.fixture(scope="module", params=FORMS, ids=lambda p: p[0] + "-occluded" * p[1])
 def episodes(request):
     return Episodes(*request.param)
 
@@ -183,13 +185,13 @@ def hidden_shares(name, seeds, size):
     return np.array(shares)
 
 
-@pytest.mark.parametrize("name", OCCLUDED)
+@pytest.mark.parametrize("name", BOX_TASKS)
 def test_the_disc_hides_half_of_the_box_in_half_of_the_starts(name):
     assert (hidden_shares(name, range(60), 120) >= 0.5).mean() >= 0.45
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", OCCLUDED)
+@pytest.mark.parametrize("name", BOX_TASKS)
 def test_the_disc_hides_half_of_the_box_in_half_of_a_thousand_starts(name):
     assert (hidden_shares(name, range(1000), 240) >= 0.5).mean() >= 0.5
 
@@ -200,15 +202,15 @@ def test_tasks_by_name():
         make_task("move_boxes")
     with pytest.raises(MerlError, match="reach_duplo has no occluded form: choose from move_box"):
         make_task("reach_duplo", occluded=True)
-    with pytest.raises(MerlError, match="start above"):
-        make_task("reach_duplo", start="around")
-    with pytest.raises(MerlError, match="occluded needs start above"):
-        make_task("lift_box", occluded=True, start="around")
+    with pytest.raises(MerlError, match="is solved where the hand starts around"):
+        make_task("reach_duplo", starts=("around",))
+    with pytest.raises(MerlError, match="occluded needs --start above"):
+        make_task("lift_box", occluded=True, starts=("around",))
 
 
-@pytest.mark.parametrize("name", AROUND)
+@pytest.mark.parametrize("name", BOX_TASKS)
 def test_the_hand_can_start_around_the_box_and_touches_nothing(name):
-    episodes, above = Episodes(name, start="around"), Episodes(name)
+    episodes, above = Episodes(name, starts=("around",)), Episodes(name)
     task, offsets, velocities = episodes.task, [], []
     for seed in range(50):
         physics = episodes.start(seed)
@@ -226,3 +228,27 @@ def test_the_hand_can_start_around_the_box_and_touches_nothing(name):
     assert (np.array(offsets) <= upper + 1e-3).all()
     assert (np.std(offsets, axis=0) > 0.003).all()
     assert max(velocities) < 1e-3
+
+
+@pytest.mark.parametrize("name", BOX_TASKS)
+def test_the_hand_can_start_with_the_box_in_it(name):
+    """Three fingers are around it: what the arm does then, the box does too."""
+    episodes = Episodes(name, starts=("holding",))
+    task, follows = episodes.task, []
+    for seed in range(10):
+        physics = episodes.start(seed)
+        assert abs(task.prop_position(physics)[2] - BOX_HALF_SIZE) < 3e-3
+        assert task.hand_distance(physics) < 0.03
+        arm = Expert(task, physics)
+        goal = Pose(arm.hand.position + np.array([0.0, 0.0, 0.05]), arm.hand.rotation)
+        for _ in range(50):
+            physics.set_control(arm.towards(goal, GRIP))
+            physics.step(task.physics_steps_per_control_step)
+        follows.append(task.prop_position(physics)[2] - BOX_HALF_SIZE > 0.03)
+    assert np.mean(follows) >= 0.8
+
+
+def test_of_several_starts_one_is_drawn():
+    episodes = Episodes("lift_box", starts=("above", "around"))
+    near = [episodes.task.hand_distance(episodes.start(seed)) < 0.05 for seed in range(30)]
+    assert 5 < sum(near) < 25

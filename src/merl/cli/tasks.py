@@ -15,7 +15,7 @@ from merl.cli.parsing import parse
 from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.registration import ENV_IDS
-from merl.tasks import OCCLUDED, TASKS
+from merl.tasks import BOX_TASKS, TASKS
 
 PICTURE_WIDTH = 40  # characters
 PICTURE_SIZE = 480  # pixels, of the files
@@ -56,7 +56,7 @@ def _entry(name: str, picture: NDArray[np.uint8], console: Console) -> Table:
         Text(f"gymnasium.make('merl:{ENV_IDS[name]}')"),
         Text(f"merl train {name}"),
     ]
-    if name in OCCLUDED:
+    if name in BOX_TASKS:
         lines.append(Text(f"merl train {name} --occluded   (a disc hides the object)"))
     entry = Table.grid(padding=(0, 2))
     shows_pictures = console.color_system is not None and console.width >= 2 * PICTURE_WIDTH

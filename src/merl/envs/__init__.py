@@ -40,5 +40,5 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
     from merl.envs.jaco_env import JacoEnv
     from merl.tasks import make_task
 
-    scene = make_task(task, occluded=settings.occluded, start=settings.start)
+    scene = make_task(task, occluded=settings.occluded, starts=settings.start)
     return JacoEnv(scene, settings, render_mode)

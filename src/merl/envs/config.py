@@ -10,7 +10,7 @@ from merl.core import MerlError, check_choice
 RendererName = Literal["gl", "warp"]
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
-StartName = Literal["above", "around"]
+StartName = Literal["above", "around", "holding"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 
@@ -41,9 +41,10 @@ class EnvConfig:
     """Put a disc between camera and object, for `move_box` and `lift_box`: what the camera does not
     see, the joints have to tell."""
 
-    start: StartName = "above"
+    start: tuple[StartName, ...] = ("above",)
     """Where the hand starts: `above` (20 to 40 cm over the floor) or, for `move_box` and
-    `lift_box`, `around` (its open fingers around the box: the tasks without the way to it)."""
+    `lift_box`, `around` (its open fingers around the box) or `holding` (closed around it). Of
+    several, one is drawn in each episode."""
 
     render_size: int = 480
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
@@ -52,7 +53,6 @@ class EnvConfig:
         check_choice("renderer", self.renderer, get_args(RendererName))
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
-        check_choice("start", self.start, get_args(StartName))
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
                 f"observations is {self.observations!r}: give a tuple of at least one of "
@@ -60,6 +60,13 @@ class EnvConfig:
             )
         for name in self.observations:
             check_choice("observations", name, OBSERVATIONS)
+        starts = get_args(StartName)
+        if isinstance(self.start, str) or not self.start:
+            raise MerlError(
+                f"start is {self.start!r}: give a tuple of at least one of {', '.join(starts)}"
+            )
+        for name in self.start:
+            check_choice("start", name, starts)
         for field in ("image_size", "render_size"):
             size = getattr(self, field)
             if type(size) is not int or not SMALLEST_IMAGE <= size <= LARGEST_IMAGE:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 from merl.core import MerlError, meant
 from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
 
 # isort: split
-from merl.tasks.jaco import HandStart, JacoTask
+from merl.tasks.jaco import ABOVE, HandStart, JacoTask
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
 
 __all__ = [
-    "AROUND",
-    "OCCLUDED",
+    "BOX_TASKS",
     "TASKS",
     "HandStart",
     "JacoTask",
@@ -27,46 +25,38 @@ __all__ = [
     "make_task",
 ]
 
-TASKS: dict[str, Callable[[], JacoTask]] = {
-    "reach_duplo": ReachDuplo,
-    "move_box": MoveBox,
-    "lift_box": LiftBox,
-}
+BOX_TASKS: dict[str, Callable[..., JacoTask]] = {"move_box": MoveBox, "lift_box": LiftBox}
+"""The tasks with a box by name: those that can be occluded, and begin with the hand at the box."""
+
+TASKS: dict[str, Callable[..., JacoTask]] = {"reach_duplo": ReachDuplo, **BOX_TASKS}
 """Every task by its name."""
 
-OCCLUDED: dict[str, Callable[[], JacoTask]] = {
-    "move_box": partial(MoveBox, occluded=True),
-    "lift_box": partial(LiftBox, occluded=True),
-}
-"""The tasks that can also be had with a disc between camera and object."""
 
-
-AROUND: dict[str, Callable[[], JacoTask]] = {
-    "move_box": partial(MoveBox, start="around"),
-    "lift_box": partial(LiftBox, start="around"),
-}
-"""The tasks in which the hand can also start around the object."""
-
-
-def make_task(name: str, *, occluded: bool = False, start: HandStart = "above") -> JacoTask:
+def make_task(
+    name: str, *, occluded: bool = False, starts: tuple[HandStart, ...] = ABOVE
+) -> JacoTask:
     """A task by its name.
 
     Args:
         name: a key of `TASKS`.
         occluded: with a disc between camera and object.
-        start: where the hand starts.
+        starts: where the hand starts; of several, one is drawn in each episode.
 
     Raises:
         MerlError: there is no such task, or it has no such form.
     """
     if name not in TASKS:
         raise MerlError(f"task {name!r} is unknown: {meant(name, TASKS)}")
-    if occluded and name not in OCCLUDED:
-        raise MerlError(f"{name} has no occluded form: choose from {', '.join(OCCLUDED)}")
-    if start == "above":
-        return (OCCLUDED if occluded else TASKS)[name]()
-    if name not in AROUND:
-        raise MerlError(f"{name} is solved where the hand starts around the object: start above")
+    if name in BOX_TASKS:
+        if occluded and starts != ABOVE:
+            raise MerlError(
+                "under the disc the hand has no room at the box: occluded needs --start above"
+            )
+        return BOX_TASKS[name](occluded=occluded, starts=starts)
     if occluded:
-        raise MerlError("under the disc there is no room for the hand: occluded needs start above")
-    return AROUND[name]()
+        raise MerlError(f"{name} has no occluded form: choose from {', '.join(BOX_TASKS)}")
+    if starts != ABOVE:
+        raise MerlError(
+            f"{name} is solved where the hand starts {starts[0]}: only {', '.join(BOX_TASKS)} can"
+        )
+    return TASKS[name]()

@@ -109,7 +109,7 @@ class Expert:
         """Go to the object."""
         rotation = self.hand.rotation
         while True:
-            yield self._towards(Pose(self.box.position + ABOVE_BRICK, rotation), np.zeros(3))
+            yield self.towards(Pose(self.box.position + ABOVE_BRICK, rotation), np.zeros(3))
 
     def lift(self) -> Actions:
         """Take hold of the box and hold it at its target."""
@@ -162,7 +162,7 @@ class Expert:
             error = place - box.position
             if from_above and np.linalg.norm(error[:2]) > OVER_PLACE:
                 error = error + ABOVE
-            yield self._towards(Pose(hand.position + error, rotation), GRIP)
+            yield self.towards(Pose(hand.position + error, rotation), GRIP)
 
     def _back_off(self) -> Actions:
         """Open the fingers and draw the hand back."""
@@ -192,7 +192,7 @@ class Expert:
                 break
             yield self._limited(TRACKING_GAIN * error, fingers())
 
-    def _towards(self, pose: Pose, fingers: Array) -> Array:
+    def towards(self, pose: Pose, fingers: Array) -> Array:
         """Velocities that bring the hand nearer to a pose."""
         twist = self.hand.twist_to(pose)
         return self._limited(self.arm.turn(self.q, SERVO_GAIN * twist), fingers)

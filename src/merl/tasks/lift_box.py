@@ -6,7 +6,7 @@ from dm_control import mjcf
 
 from merl.tasks import rewards
 from merl.tasks.box import BOX_HALF_SIZE, add_disc, make_box
-from merl.tasks.jaco import HandStart, JacoTask
+from merl.tasks.jaco import ABOVE, HandStart, JacoTask
 
 TARGET = (0.0, 0.0, 0.18)
 """Where the centre of the box is to be, m. It is not marked."""
@@ -23,7 +23,7 @@ class LiftBox(JacoTask):
 
     Args:
         occluded: put a disc between camera and box.
-        start: where the hand starts; under the disc there is no room for it around the box.
+        starts: where the hand starts; under the disc there is no room for it around the box.
 
     Attributes:
         vertical_cosine: from this `tilt_cosine` on the hand counts as vertical.
@@ -32,8 +32,10 @@ class LiftBox(JacoTask):
     term_names = ("reaching", "vertical", "floating", "lifting")
     success_distance = rewards.GOAL_DISTANCE
 
-    def __init__(self, occluded: bool = False, start: HandStart = "above") -> None:
-        super().__init__(make_box(), BOX_HALF_SIZE, TARGET_OVER_DISC if occluded else TARGET, start)
+    def __init__(self, occluded: bool = False, starts: tuple[HandStart, ...] = ABOVE) -> None:
+        super().__init__(
+            make_box(), BOX_HALF_SIZE, TARGET_OVER_DISC if occluded else TARGET, starts
+        )
         self.vertical_cosine = rewards.VERTICAL_COSINE
         if occluded:
             self.vertical_cosine = VERTICAL_COSINE_AROUND_DISC

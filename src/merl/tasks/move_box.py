@@ -6,7 +6,7 @@ from dm_control import mjcf
 
 from merl.tasks import rewards
 from merl.tasks.box import BOX_HALF_SIZE, add_disc, make_box
-from merl.tasks.jaco import HandStart, JacoTask
+from merl.tasks.jaco import ABOVE, HandStart, JacoTask
 
 TARGET = (0.0, -0.2, BOX_HALF_SIZE)
 """Where the centre of the box is to be, m: on the floor, nearer to the camera than it starts."""
@@ -24,14 +24,14 @@ class MoveBox(JacoTask):
 
     Args:
         occluded: put a disc between camera and box.
-        start: where the hand starts; under the disc there is no room for it around the box.
+        starts: where the hand starts; under the disc there is no room for it around the box.
     """
 
     term_names = ("reaching", "pushing")
     success_distance = rewards.GOAL_DISTANCE
 
-    def __init__(self, occluded: bool = False, start: HandStart = "above") -> None:
-        super().__init__(make_box(), BOX_HALF_SIZE, TARGET, start)
+    def __init__(self, occluded: bool = False, starts: tuple[HandStart, ...] = ABOVE) -> None:
+        super().__init__(make_box(), BOX_HALF_SIZE, TARGET, starts)
         # An opaque patch that touches nothing: the ray tracer draws neither sites nor transparency.
         self._arena.mjcf_model.worldbody.add(
             "geom",

@@ -252,5 +252,7 @@ def test_every_setting_is_a_plain_value():
         "state": "absolute",
         "observations": ("image", "proprio"),
         "occluded": False,
+        "start": ("above",),
+        "goal_reward": "near",
         "render_size": 480,
     }

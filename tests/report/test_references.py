@@ -1,5 +1,8 @@
 """What returns are compared with."""
 
+import pytest
+
+from merl.envs.config import EnvConfig
 from merl.report.references import references
 
 
@@ -11,7 +14,7 @@ def test_every_task_has_a_floor_and_a_ceiling():
         ("move_box", True),
         ("lift_box", True),
     ]:
-        rows = {row.name: row for row in references(task, occluded=occluded)}
+        rows = {row.name: row for row in references(task, EnvConfig(occluded=occluded))}
         chance, still, expert = (
             rows[name] for name in ("random actions", "no motion", "scripted expert")
         )
@@ -31,3 +34,8 @@ def test_what_is_published_says_where():
 
 def test_a_task_of_ones_own_has_none():
     assert references("my_package:make_env") == ()
+
+
+@pytest.mark.parametrize("form", [EnvConfig(start=("around",)), EnvConfig(goal_reward="far")])
+def test_a_form_that_was_not_measured_has_none(form):
+    assert references("move_box", form) == ()

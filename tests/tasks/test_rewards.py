@@ -50,6 +50,18 @@ def test_move(hand: float, goal: float, reaching: float, pushing: float) -> None
 
 
 @pytest.mark.parametrize(
+    ("distance", "share"), [(0.0, 1.0), (0.01, 1.0), (0.16, 0.5), (0.31, 0.0), (0.5, 0.0)]
+)
+def test_a_goal_that_is_seen_from_afar(distance: float, share: float) -> None:
+    moved = rewards.move(NEAR, distance, goal="far")
+    assert moved["pushing"] == pytest.approx(share / 2, abs=1e-6)
+    assert rewards.move(FAR, distance, goal="far")["pushing"] == 0.0
+    lifted = rewards.lift(NEAR, 1.0, 0.0351, 0.18, distance, goal="far")
+    assert lifted["lifting"] == pytest.approx(share / 4, abs=1e-6)
+    assert rewards.lift(NEAR, 1.0, 0.035, 0.18, distance, goal="far")["lifting"] == 0.0
+
+
+@pytest.mark.parametrize(
     ("hand", "cosine", "height", "goal", "expected"),
     [
         # reaching, vertical, floating, lifting; each a quarter, the target at 0.18

@@ -63,7 +63,7 @@ def evaluate(args: list[str]) -> int:
     told = f"{options.run} at step {policy.step:,}{pictures}: {describe(result)}"
     console.print(told, highlight=False)
     config = policy.config
-    beside = references(config.task, occluded=config.env.occluded)
+    beside = references(config.task, config.env)
     if beside:
         console.print(comparison(config.task, result, beside), highlight=False)
     if options.video is not None:

@@ -27,7 +27,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
     run, trained = outcome.run, outcome.evaluation
     if trained is None:
         return
-    beside = references(run.config.task, occluded=run.config.env.occluded)
+    beside = references(run.config.task, run.config.env)
     beside = beside or (random_reference(run.config),)
     console.print()
     console.print(comparison(run.config.task, trained, beside))

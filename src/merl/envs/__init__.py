@@ -40,5 +40,7 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
     from merl.envs.jaco_env import JacoEnv
     from merl.tasks import make_task
 
-    scene = make_task(task, occluded=settings.occluded, starts=settings.start)
+    scene = make_task(
+        task, occluded=settings.occluded, starts=settings.start, goal=settings.goal_reward
+    )
     return JacoEnv(scene, settings, render_mode)

@@ -11,6 +11,7 @@ RendererName = Literal["gl", "warp"]
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
+GoalRewardName = Literal["near", "far"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 
@@ -46,6 +47,10 @@ class EnvConfig:
     `lift_box`, `around` (its open fingers around the box) or `holding` (closed around it). Of
     several, one is drawn in each episode."""
 
+    goal_reward: GoalRewardName = "near"
+    """How far the reward for the box's place reaches, in `move_box` and `lift_box`: `near` (a long
+    tail, to a tenth 5 cm away) or `far` (a straight line, to nothing 30 cm away)."""
+
     render_size: int = 480
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
 
@@ -53,6 +58,7 @@ class EnvConfig:
         check_choice("renderer", self.renderer, get_args(RendererName))
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
+        check_choice("goal_reward", self.goal_reward, get_args(GoalRewardName))
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
                 f"observations is {self.observations!r}: give a tuple of at least one of "

@@ -12,6 +12,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
+from merl.envs.config import EnvConfig
 from merl.statistics import Interval
 
 
@@ -32,14 +33,17 @@ class Reference:
     source: str
 
 
-def references(task: str, *, occluded: bool = False) -> tuple[Reference, ...]:
-    """The references of a task, from the least to the best; none for a task that is not known.
+def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]:
+    """The references of a task, from the least to the best; none where none were measured.
 
     Args:
         task: the task's name.
-        occluded: in its occluded form.
+        env: its form: occluded or not; with other starts or another reward none were measured.
     """
-    rows = _measured().get(task + OCCLUDED * occluded, [])
+    form, plain = env or EnvConfig(), EnvConfig()
+    if (form.start, form.goal_reward) != (plain.start, plain.goal_reward):
+        return ()
+    rows = _measured().get(task + OCCLUDED * form.occluded, [])
     return tuple(
         Reference(
             row["name"],

@@ -12,10 +12,12 @@ from merl.tasks.jaco import ABOVE, HandStart, JacoTask
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
+from merl.tasks.rewards import GoalReward
 
 __all__ = [
     "BOX_TASKS",
     "TASKS",
+    "GoalReward",
     "HandStart",
     "JacoTask",
     "LiftBox",
@@ -33,7 +35,11 @@ TASKS: dict[str, Callable[..., JacoTask]] = {"reach_duplo": ReachDuplo, **BOX_TA
 
 
 def make_task(
-    name: str, *, occluded: bool = False, starts: tuple[HandStart, ...] = ABOVE
+    name: str,
+    *,
+    occluded: bool = False,
+    starts: tuple[HandStart, ...] = ABOVE,
+    goal: GoalReward = "near",
 ) -> JacoTask:
     """A task by its name.
 
@@ -41,6 +47,7 @@ def make_task(
         name: a key of `TASKS`.
         occluded: with a disc between camera and object.
         starts: where the hand starts; of several, one is drawn in each episode.
+        goal: how far the reward for the object's place reaches, where it has one.
 
     Raises:
         MerlError: there is no such task, or it has no such form.
@@ -52,11 +59,13 @@ def make_task(
             raise MerlError(
                 "under the disc the hand has no room at the box: occluded needs --start above"
             )
-        return BOX_TASKS[name](occluded=occluded, starts=starts)
+        return BOX_TASKS[name](occluded=occluded, starts=starts, goal=goal)
     if occluded:
         raise MerlError(f"{name} has no occluded form: choose from {', '.join(BOX_TASKS)}")
     if starts != ABOVE:
         raise MerlError(
             f"{name} is solved where the hand starts {starts[0]}: only {', '.join(BOX_TASKS)} can"
         )
+    if goal != "near":
+        raise MerlError(f"{name} brings nothing to a goal: only {', '.join(BOX_TASKS)} do")
     return TASKS[name]()

@@ -24,19 +24,26 @@ class LiftBox(JacoTask):
     Args:
         occluded: put a disc between camera and box.
         starts: where the hand starts; under the disc there is no room for it around the box.
+        goal: how far the reward for the box's place reaches.
 
     Attributes:
+        goal: how far the reward for the box's place reaches.
         vertical_cosine: from this `tilt_cosine` on the hand counts as vertical.
     """
 
     term_names = ("reaching", "vertical", "floating", "lifting")
     success_distance = rewards.GOAL_DISTANCE
 
-    def __init__(self, occluded: bool = False, starts: tuple[HandStart, ...] = ABOVE) -> None:
+    def __init__(
+        self,
+        occluded: bool = False,
+        starts: tuple[HandStart, ...] = ABOVE,
+        goal: rewards.GoalReward = "near",
+    ) -> None:
         super().__init__(
             make_box(), BOX_HALF_SIZE, TARGET_OVER_DISC if occluded else TARGET, starts
         )
-        self.vertical_cosine = rewards.VERTICAL_COSINE
+        self.goal, self.vertical_cosine = goal, rewards.VERTICAL_COSINE
         if occluded:
             self.vertical_cosine = VERTICAL_COSINE_AROUND_DISC
             add_disc(self._arena, DISC_RADIUS)
@@ -55,4 +62,5 @@ class LiftBox(JacoTask):
             target_height=float(self.target[2]),
             goal_distance=self.goal_distance(physics),
             vertical_cosine=self.vertical_cosine,
+            goal=self.goal,
         )

@@ -25,13 +25,23 @@ class MoveBox(JacoTask):
     Args:
         occluded: put a disc between camera and box.
         starts: where the hand starts; under the disc there is no room for it around the box.
+        goal: how far the reward for the box's place reaches.
+
+    Attributes:
+        goal: the same.
     """
 
     term_names = ("reaching", "pushing")
     success_distance = rewards.GOAL_DISTANCE
 
-    def __init__(self, occluded: bool = False, starts: tuple[HandStart, ...] = ABOVE) -> None:
+    def __init__(
+        self,
+        occluded: bool = False,
+        starts: tuple[HandStart, ...] = ABOVE,
+        goal: rewards.GoalReward = "near",
+    ) -> None:
         super().__init__(make_box(), BOX_HALF_SIZE, TARGET, starts)
+        self.goal = goal
         # An opaque patch that touches nothing: the ray tracer draws neither sites nor transparency.
         self._arena.mjcf_model.worldbody.add(
             "geom",
@@ -52,4 +62,6 @@ class MoveBox(JacoTask):
 
     def reward_terms(self, physics: mjcf.Physics) -> rewards.Terms:
         """Eq. 4: `reaching` and `pushing`, each in [0, 1/2]."""
-        return rewards.move(self.hand_distance(physics), self.goal_distance(physics))
+        return rewards.move(
+            self.hand_distance(physics), self.goal_distance(physics), goal=self.goal
+        )

@@ -6,6 +6,8 @@ in [0, 1]. Distances and heights are in metres.
 
 from __future__ import annotations
 
+from typing import Literal
+
 from dm_control.utils.rewards import tolerance
 
 REACHING_DISTANCE = 0.05
@@ -16,6 +18,9 @@ GOAL_DISTANCE = 0.01
 """epsilon_pushing and epsilon_lifting: the object is at its target when it is this near, m."""
 GOAL_MARGIN = 0.05
 """Beyond it the reward falls off with a long tail, to 0.1 at this distance more, m."""
+FAR_GOAL_MARGIN = 0.3
+"""In place of that, where the reward is to tell from afar which way the goal is: it falls off in a
+straight line, to 0 at this distance more, m."""
 VERTICAL_COSINE = 0.99
 """1 - epsilon_vertical: the hand points down when the cosine of its tilt is at least this."""
 VERTICAL_MARGIN = 0.99
@@ -23,6 +28,8 @@ VERTICAL_MARGIN = 0.99
 FLOATING_HEIGHT = 0.035
 """epsilon_floating: the object is off the floor when its centre is above this, m."""
 
+GoalReward = Literal["near", "far"]
+"""How far the reward for the object's place reaches: `GOAL_MARGIN` or `FAR_GOAL_MARGIN`."""
 Terms = dict[str, float]
 
 
@@ -38,12 +45,13 @@ def reach(hand_distance: float) -> Terms:
     return {"reaching": _near(hand_distance)}
 
 
-def move(hand_distance: float, goal_distance: float) -> Terms:
+def move(hand_distance: float, goal_distance: float, *, goal: GoalReward = "near") -> Terms:
     """Eq. 4, N = 2: bring the object to a place on the floor; it counts while the hand is at it.
 
     Args:
         hand_distance: from the tool centre point to the object, m.
         goal_distance: from the object to its target, m.
+        goal: how far the reward for the object's place reaches.
 
     Returns:
         `reaching` and `pushing`, each in [0, 1/2].
@@ -51,7 +59,7 @@ def move(hand_distance: float, goal_distance: float) -> Terms:
     at_object = hand_distance < REACHING_DISTANCE
     return _stages(
         reaching=_near(hand_distance),
-        pushing=_at_goal(goal_distance) if at_object else 0.0,
+        pushing=_at_goal(goal_distance, goal) if at_object else 0.0,
     )
 
 
@@ -63,6 +71,7 @@ def lift(
     goal_distance: float,
     *,
     vertical_cosine: float = VERTICAL_COSINE,
+    goal: GoalReward = "near",
 ) -> Terms:
     """Eq. 5, N = 4: raise the object to a place in the air, with the hand pointing down.
 
@@ -76,6 +85,7 @@ def lift(
         target_height: of the target above the floor, m, above 0.
         goal_distance: from the object to its target, m.
         vertical_cosine: 1 - epsilon_vertical, from which on the hand counts as vertical.
+        goal: how far the reward for the object's place reaches.
 
     Returns:
         `reaching`, `vertical`, `floating` and `lifting`, each in [0, 1/4].
@@ -86,7 +96,7 @@ def lift(
         reaching=_near(hand_distance),
         vertical=_upright(tilt_cosine, vertical_cosine),
         floating=min(max(height / target_height, 0.0), 1.0) if at_object else 0.0,
-        lifting=_at_goal(goal_distance) if off_floor else 0.0,
+        lifting=_at_goal(goal_distance, goal) if off_floor else 0.0,
     )
 
 
@@ -100,8 +110,11 @@ def _near(distance: float) -> float:
     return float(tolerance(distance, bounds, margin=REACHING_MARGIN, sigmoid="gaussian"))
 
 
-def _at_goal(distance: float) -> float:
+def _at_goal(distance: float, goal: GoalReward) -> float:
     bounds = (0.0, GOAL_DISTANCE)
+    if goal == "far":
+        linear = {"sigmoid": "linear", "value_at_margin": 0.0}
+        return float(tolerance(distance, bounds, margin=FAR_GOAL_MARGIN, **linear))
     return float(tolerance(distance, bounds, margin=GOAL_MARGIN, sigmoid="long_tail"))
 
 

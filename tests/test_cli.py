@@ -282,6 +282,9 @@ BAD = {
     "train reach_duplo --agent.vectors joints": "the environment gives ['proprio', 'state']",
     "train reach_duplo --image-size 8": "16",
     "train reach_duplo --renderer wrap": "'gl', 'warp'",
+    "train reach_duplo --start around": "is solved where the hand starts around",
+    "train move_box --preset smoke --start around --occluded": "occluded needs --start above",
+    "train reach_duplo --goal-reward far": "brings nothing to a goal",
     "train reach_duplo --minutes 0": "minutes must be above 0",
     "trian reach_duplo": "did you mean 'train'",
     "evaluate nowhere": "is not a run",
@@ -302,6 +305,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert error.count("\n") == 1
     assert BAD[line] in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_may_be_left_out_is_not_offered_as_none(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "nowhere", "--renderer", "wrap"]) == 2
+    error = capsys.readouterr().err
+    assert "'warp'" in error
+    assert "None" not in error
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

@@ -59,6 +59,7 @@ def _one_line(box: str) -> str:
     if not message:
         return " ".join(box.split())
     message = message[0].lower() + message[1:]
+    message = re.sub(r"'None', |, 'None'", "", message)  # a flag is left out, not set to None
     if "erhaps you meant" in box:
         flags = [match for line in lines if (match := re.match(r"--\w[\w.-]*", line))]
         if flags:

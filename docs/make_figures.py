@@ -21,18 +21,18 @@ def main() -> None:
         references=lines,
         title="reach_duplo",
     )
-    reward_terms(
-        {
-            "move_box": DOCS / "data" / "state-move_box-seed0.csv",
-            "move_box, margin of the goal 0.2 m": DOCS
-            / "data"
-            / "state-move_box-margin20-seed0.csv",
-            "move_box, goal linear to 0.3 m": DOCS / "data" / "state-move_box-linear30-seed0.csv",
-            "lift_box": DOCS / "data" / "state-lift_box-seed0.csv",
-            "lift_box, goal linear to 0.3 m": DOCS / "data" / "state-lift_box-linear30-seed0.csv",
-        },
-        DOCS / "images" / "state.png",
-    )
+    states = {
+        "reach_duplo": "reach_duplo",
+        "move_box": "move_box",
+        "move_box, margin of the goal 0.2 m": "move_box-margin20",
+        "move_box, goal linear to 0.3 m": "move_box-linear30",
+        "move_box, the same, the hand around the box": "move_box-around",
+        "lift_box": "lift_box",
+        "lift_box, goal linear to 0.3 m": "lift_box-linear30",
+        "lift_box, the same, the hand around or holding the box": "lift_box-holding",
+    }
+    files = {title: DOCS / "data" / f"state-{name}-seed0.csv" for title, name in states.items()}
+    reward_terms(files, DOCS / "images" / "state.png")
     for seed in range(3):
         print(f"seed {seed}: {mean_return(f'laptop-seed{seed}'):.1f}")
 

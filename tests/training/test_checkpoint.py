@@ -72,6 +72,13 @@ def test_round_trip(tmp_path: Path, config: AgentConfig) -> None:
     assert torch.equal(weights(saved), weights(other))
 
 
+def test_a_hundred_million_steps_come_after_ninety_nine(tmp_path: Path) -> None:
+    for step in (99_990_000, 99_995_000, 100_000_000):
+        save(tmp_path, step, agent(), {}, score=None, keep=2)
+    assert Checkpoint.find(tmp_path).step == 100_000_000
+    assert not (tmp_path / "99990000").exists()
+
+
 def test_keeps_the_last_and_the_best(tmp_path: Path) -> None:
     for step, score in ((100, 1.0), (200, 9.0), (300, None), (400, 3.0), (500, None)):
         save(tmp_path, step, agent(), {}, score=score, keep=2)

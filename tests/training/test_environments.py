@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -145,8 +146,9 @@ def test_workers_end_with_the_run_that_is_killed(tmp_path: Path) -> None:
     assert not alive
 
 
-def test_a_signal_to_all_processes_saves(tmp_path: Path) -> None:
-    """A batch system sends it to the workers too."""
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+def test_a_signal_to_all_processes_saves(tmp_path: Path, number: int) -> None:
+    """A terminal or a batch system sends it to the workers too."""
     run = tmp_path / "run"
     line = ["train", "worker_envs:slow", *SMALL, "--steps", "5000", "--num-envs", "2"]
     process = subprocess.Popen(
@@ -157,11 +159,16 @@ def test_a_signal_to_all_processes_saves(tmp_path: Path) -> None:
     )
     while not list(run.glob("checkpoints/0*1*")) and process.poll() is None:
         time.sleep(0.05)
-    os.killpg(process.pid, 15)
+    os.killpg(process.pid, number)
     out, _ = process.communicate(timeout=60)
-    assert process.returncode == 128 + 15
+    assert process.returncode == 128 + number
     assert "and saved: go on with" in out
     assert cli.main(["resume", str(run), "--minutes", "0.02"]) == 0
+
+
+def test_an_error_that_cannot_be_sent_ends_the_run(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="LocalError: the gripper is gone"):
+        train(tmp_path / "run", "fails", "--num-envs", "2")
 
 
 def test_environments_step_while_the_learner_learns(

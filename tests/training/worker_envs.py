@@ -74,6 +74,22 @@ class Slow(Plain):
         return super().step(action)
 
 
+class Failing(Plain):
+    """Fails with an exception that another process cannot be told."""
+
+    def step(self, action: Any) -> Any:
+        class LocalError(Exception):
+            pass
+
+        if multiprocessing.parent_process() is not None:
+            raise LocalError("the gripper is gone")
+        return super().step(action)
+
+
+def fails() -> Plain:
+    return Failing()
+
+
 def plain() -> Plain:
     return Plain()
 

@@ -59,12 +59,18 @@ def _one_line(box: str) -> str:
     if not message:
         return " ".join(box.split())
     message = message[0].lower() + message[1:]
-    message = re.sub(r"'None', |, 'None'", "", message)  # a flag is left out, not set to None
+    message = re.sub(r"\('[^()]*'\)", _choices, message)
     if "erhaps you meant" in box:
         flags = [match for line in lines if (match := re.match(r"--\w[\w.-]*", line))]
         if flags:
             message += f": did you mean {flags[0].group()}?"
     return message
+
+
+def _choices(listed: re.Match[str]) -> str:
+    """The choices in order; None is no choice: a flag is left out, not set to it."""
+    names = sorted(set(re.findall(r"'([^']*)'", listed.group())) - {"None"})
+    return f"({', '.join(map(repr, names))})"
 
 
 def program() -> str:

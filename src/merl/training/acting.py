@@ -7,6 +7,8 @@ environments in processes of their own step while the learner learns.
 from __future__ import annotations
 
 import multiprocessing
+import pickle
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -16,6 +18,7 @@ from typing import Any, NamedTuple, Protocol
 import gymnasium
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.vector.async_vector_env import AsyncState
 from numpy.typing import NDArray
 
 from merl.core import EnvironmentsLost, Observation
@@ -24,6 +27,11 @@ from merl.training.environment import environment_state, make_run_env, set_envir
 
 _INFO = ("success", "reward_terms")
 """What the loop wants to know beside the reward."""
+_TOLD = "told"
+"""The only key of a worker's info; under it lies what its environment told of `_INFO`."""
+_LEFT_TO_THE_RUN = (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
+"""A terminal or a batch system sends them to the workers too, which are to work on until the run
+has saved and ends them. SIGTERM is what they are ended by."""
 
 
 START_SECONDS = 300.0
@@ -195,7 +203,7 @@ class Workers:
                 float(rewards[index]),
                 bool(terminated[index]),
                 bool(truncated[index]),
-                _nth(infos, index),
+                infos[_TOLD][index][0],
             )
             for index in range(self.count)
         ]
@@ -267,17 +275,27 @@ def _end(env: AsyncVectorEnv) -> None:
             env.close()
         except Exception:  # a pipe or a process is gone: no way to end in good order
             _kill()
+            env._state = AsyncState.DEFAULT  # nothing will answer what it waits for
             with suppress(Exception):
                 env.close(terminate=True)
 
 
 def _nth(batch: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """One environment's part of a batched observation or info."""
-    return {
-        key: _nth(value, index) if isinstance(value, Mapping) else value[index]
-        for key, value in batch.items()
-        if not key.startswith("_")  # Gymnasium's marks of who gave an info
-    }
+    """One environment's part of a batched observation."""
+    return {key: value[index] for key, value in batch.items()}
+
+
+@contextmanager
+def _errors_that_arrive() -> Iterator[None]:
+    """Replace an exception that cannot be pickled: the other process would wait for it forever."""
+    try:
+        yield
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            raise RuntimeError(f"{type(error).__name__}: {error}") from None
+        raise
 
 
 class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -288,19 +306,24 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._index = index
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        observation, _ = self.env.reset(**options)
+        with _errors_that_arrive():
+            observation, _ = self.env.reset(**options)
         return observation, {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        with _errors_that_arrive():
+            observation, reward, terminated, truncated, info = self.env.step(action)
         told = {name: info[name] for name in _INFO if name in info}
-        return observation, reward, terminated, truncated, told
+        # In a tuple, lest Gymnasium merge it with what the other environments tell.
+        return observation, reward, terminated, truncated, {_TOLD: (told,)}
 
     def state(self) -> dict[str, Any] | None:
-        return environment_state(self.env)
+        with _errors_that_arrive():
+            return environment_state(self.env)
 
     def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
-        set_environment_state(self.env, states[self._index])
+        with _errors_that_arrive():
+            set_environment_state(self.env, states[self._index])
 
 
 class _Lent(gymnasium.Env[Any, Any]):
@@ -321,7 +344,10 @@ class _Maker:
     def __call__(self) -> gymnasium.Env[Any, Any]:
         if self.here is not None:
             return _Lent(self.here)
-        return _Worker(make_run_env(self.config), self.index)
+        for number in _LEFT_TO_THE_RUN:
+            signal.signal(number, signal.SIG_IGN)
+        with _errors_that_arrive():
+            return _Worker(make_run_env(self.config), self.index)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"config": self.config, "index": self.index, "here": None}

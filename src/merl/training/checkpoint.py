@@ -232,7 +232,8 @@ def _folders(root: Path) -> list[Path]:
     """Checkpoints by step, oldest first."""
     if not root.is_dir():
         return []
-    return sorted(path for path in root.iterdir() if path.is_dir() and path.name.isdigit())
+    folders = [path for path in root.iterdir() if path.is_dir() and path.name.isdigit()]
+    return sorted(folders, key=lambda path: int(path.name))
 
 
 def _prune(root: Path, step: int, keep: int) -> None:

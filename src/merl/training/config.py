@@ -120,8 +120,10 @@ class TrainConfig:
                 raise MerlError(f"{flag} must be at least 0, not {getattr(self, name)}")
         if self.minutes is not None and not self.minutes > 0:
             raise MerlError(f"minutes must be above 0, not {self.minutes}")
-        if not 0 < self.worker_timeout < math.inf:
-            raise MerlError(f"worker-timeout must be above 0 seconds, not {self.worker_timeout}")
+        if not 0 < self.worker_timeout <= 1e6:  # some 2e6 s are more than a poll can wait
+            raise MerlError(
+                f"worker-timeout must be above 0 and at most 1e6 seconds, not {self.worker_timeout}"
+            )
         if self.num_envs > MOST_ENVS:
             raise MerlError(f"num-envs must be at most {MOST_ENVS}, not {self.num_envs}")
         if self.threads is not None and self.threads < 1:

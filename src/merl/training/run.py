@@ -170,7 +170,10 @@ class Run:
         """Replace `config.json` whole."""
         part = self.path / f".{CONFIG_FILE}.part"
         try:
-            part.write_text(json.dumps(record, indent=1))
+            with part.open("w") as file:
+                file.write(json.dumps(record, indent=1))
+                file.flush()
+                os.fsync(file.fileno())
             part.replace(self.path / CONFIG_FILE)
         except OSError as error:
             raise MerlError(f"{self.path} cannot be written to: {error.strerror}") from None

@@ -237,7 +237,7 @@ class _Stretch:
         self.view.begin(self.run, trainer)
         if not trainer.films and self.config.eval.video != "none":
             self.view.warn("there will be no videos: the environment does not render to an array")
-        if None in self.environments.states():
+        if None in self._environment_states():
             self.view.warn(
                 "a resumed run will meet other episodes than this one would: the environment does "
                 "not draw from Gymnasium's np_random"
@@ -268,7 +268,8 @@ class _Stretch:
         trainer.randomness.load_state_dict(state["randomness"])
         self.replay.load_state_dict(state["replay"])
         states = state["environment"]
-        self.environments.restore(states if isinstance(states, list) else [states])
+        self._states = states if isinstance(states, list) else [states]
+        self.environments.restore(self._states)
         self.clock = Clock(state["seconds"], state["cpu_seconds"])
         self.metrics.trim(trainer.progress.step)
 

@@ -27,6 +27,7 @@ def main() -> None:
         "move_box, margin of the goal 0.2 m": "move_box-margin20",
         "move_box, goal linear to 0.3 m": "move_box-linear30",
         "move_box, the same, the hand around the box": "move_box-around",
+        "move_box, the same, around or holding, smooth floor": "move_box-smooth",
         "lift_box": "lift_box",
         "lift_box, goal linear to 0.3 m": "lift_box-linear30",
         "lift_box, the same, the hand around or holding the box": "lift_box-holding",

@@ -129,6 +129,17 @@ def test_workers_that_are_lost_too_often_end_the_run_with_a_checkpoint(
     assert Checkpoint.find(Run.open(run).checkpoints).step == 100
 
 
+def test_workers_that_die_before_the_first_step_leave_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert train(run, "stillborn", "--no-synchronous", "--worker-restarts", "0") == 4
+    said = " ".join(capfd.readouterr().err.split())
+    assert "after 0 restarts: the run ends before its first step" in said
+    assert "Traceback" not in said
+    assert not run.exists()
+
+
 def test_workers_end_with_the_run_that_is_killed(tmp_path: Path) -> None:
     line = ["train", "worker_envs:slow", *SMALL, "--steps", "5000", "--num-envs", "2"]
     process = subprocess.Popen(

@@ -86,6 +86,19 @@ class Failing(Plain):
         return super().step(action)
 
 
+class Stillborn(Plain):
+    """Dies at its first reset, if it has a process of its own."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        if multiprocessing.parent_process() is not None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().reset(seed=seed)
+
+
+def stillborn() -> Plain:
+    return Stillborn()
+
+
 def fails() -> Plain:
     return Failing()
 

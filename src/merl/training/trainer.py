@@ -269,7 +269,12 @@ class _Stretch:
         self.replay.load_state_dict(state["replay"])
         states = state["environment"]
         self._states = states if isinstance(states, list) else [states]
-        self.environments.restore(self._states)
+        try:
+            self.environments.restore(self._states)
+        except Lost as lost:
+            raise EnvironmentsLost(
+                f"an environment's process {lost} right after its start: see what it said above"
+            ) from None
         self.clock = Clock(state["seconds"], state["cpu_seconds"])
         self.metrics.trim(trainer.progress.step)
 
@@ -283,9 +288,11 @@ class _Stretch:
         most = self.config.worker_restarts
         if self.losses > most:
             self._save()
+            step = self.trainer.progress.step
+            saved = f"the run is saved at step {step:,}; go on with `merl resume {self.run.path}`"
             raise EnvironmentsLost(
-                f"an environment's process {what}, after {most} restarts: the run is saved at step "
-                f"{self.trainer.progress.step:,}; go on with `merl resume {self.run.path}`"
+                f"an environment's process {what}, after {most} restarts: "
+                + (saved if step else "the run ends before its first step")
             )
         self.view.warn(
             f"an environment's process {what}: starting the environments again ({self.losses} of "

@@ -3,12 +3,13 @@
 import numpy as np
 
 from merl.tasks import jaco, make_task
+from merl.tasks.box import ABOVE
 
 
 class Episodes:
     """A task, started in the way of `JacoEnv`: one physics for all episodes."""
 
-    def __init__(self, name, occluded=False, starts=jaco.ABOVE):
+    def __init__(self, name, occluded=False, starts=ABOVE):
         self.name, self.occluded = name, occluded
         self.task = make_task(name, occluded=occluded, starts=starts)
         self.physics = self.task.compile()

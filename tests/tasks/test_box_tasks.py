@@ -9,7 +9,7 @@ from dm_control import composer
 from episodes import Episodes, check_starts, check_uniform
 from merl.core import MerlError
 from merl.tasks import BOX_TASKS, TASKS, jaco, make_task, rewards
-from merl.tasks.box import BOX_HALF_SIZE, BOX_MASS
+from merl.tasks.box import AROUND_BOX, BOX_HALF_SIZE, BOX_MASS
 from merl.tasks.expert import GRIP, Expert
 from merl.tasks.kinematics import Pose
 
@@ -223,7 +223,7 @@ def test_the_hand_can_start_around_the_box_and_touches_nothing(name):
         for contact in physics.data.contact:
             pair = {contact.geom1, contact.geom2}
             assert contact.dist > 0 or not pair & robot or pair <= robot
-    lower, upper = np.array(jaco.AROUND_OBJECT)
+    lower, upper = np.array(AROUND_BOX)
     assert (np.array(offsets) >= lower - 1e-3).all()
     assert (np.array(offsets) <= upper + 1e-3).all()
     assert (np.std(offsets, axis=0) > 0.003).all()

@@ -8,7 +8,8 @@ from merl.core import MerlError, meant
 from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
 
 # isort: split
-from merl.tasks.jaco import ABOVE, HandStart, JacoTask
+from merl.tasks.box import ABOVE, BoxTask, HandStart
+from merl.tasks.jaco import JacoTask
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
@@ -27,10 +28,10 @@ __all__ = [
     "make_task",
 ]
 
-BOX_TASKS: dict[str, Callable[..., JacoTask]] = {"move_box": MoveBox, "lift_box": LiftBox}
+BOX_TASKS: dict[str, type[BoxTask]] = {"move_box": MoveBox, "lift_box": LiftBox}
 """The tasks with a box by name: those that can be occluded, and begin with the hand at the box."""
 
-TASKS: dict[str, Callable[..., JacoTask]] = {"reach_duplo": ReachDuplo, **BOX_TASKS}
+TASKS: dict[str, Callable[[], JacoTask]] = {"reach_duplo": ReachDuplo, **BOX_TASKS}
 """Every task by its name."""
 
 

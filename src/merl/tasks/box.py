@@ -1,9 +1,20 @@
-"""What the two tasks with a box share: the box, and the disc that hides it from the camera."""
+"""What the tasks with a box share: the box, a disc that hides it, starts with the hand at it."""
 
 from __future__ import annotations
 
-from dm_control import composer
+from contextlib import suppress
+from typing import Literal
+
+import numpy as np
+from dm_control import composer, mjcf
+from dm_control.composer import initializers
+from dm_control.composer.variation import distributions
 from dm_control.entities import props
+from dm_control.manipulation.shared import workspaces
+
+from merl.tasks.jaco import Box, JacoTask, Position
+from merl.tasks.rewards import GOAL_DISTANCE, GoalReward
+from merl.tasks.simulator import quiet_inverse_kinematics
 
 BOX_HALF_SIZE = 0.025
 """Half the length of an edge, m: also the height at which the box's centre rests."""
@@ -14,17 +25,121 @@ DISC_CENTER = (0.0, -0.06)
 from where the camera stands it hides most of what lies there (docs/tasks.md)."""
 DISC_HEIGHT = (0.135, 0.150)
 """Lower and upper face of the disc, m above the floor."""
+AROUND_BOX = Box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.02))
+"""Where the tool centre point starts around the box, from the box's centre, m."""
+CLOSED_AROUND_BOX = (0.2, 0.6)
+"""By which share the fingers are closed there, at least and at most: they do not yet touch it."""
+ATTEMPTS = 20
+"""To draw a start around the box in which the hand does not touch it."""
+CLOSING_VELOCITY = 1.0
+"""Of the fingers that close around the box before an episode begins, rad/s."""
+CLOSING_STEPS = 20
+"""For so many control steps: enough from the widest start."""
+HandStart = Literal["above", "around", "holding"]
+"""Where the hand starts: above the workspace, open around the box, or closed around it."""
+ABOVE: tuple[HandStart, ...] = ("above",)
+"""dm_control's start, that of every `JacoTask`."""
 _RED = (1.0, 0.0, 0.0, 1.0)
 _GREY = (0.5, 0.5, 0.5, 1.0)
 
 
-def make_box() -> composer.Entity:
-    """A red cube."""
-    size = [BOX_HALF_SIZE] * 3
-    return props.Primitive(geom_type="box", size=size, mass=BOX_MASS, rgba=_RED, name="box")
+class BoxTask(JacoTask):
+    """A task with a red cube, which may be hidden, and at which the hand may start.
+
+    The start `above` is that of `JacoTask`. In `around` the hand is then moved to the box, to a
+    place drawn from `AROUND_BOX` and with its fingers closed by a share of `CLOSED_AROUND_BOX`,
+    where it touches nothing; should none be found, which is rare, it stays where it was. In
+    `holding` the fingers have closed from there, and hold the box, which is on the floor.
+
+    Args:
+        occluded: put a disc between camera and box.
+        starts: where the hand starts; of several, one is drawn in each episode. Under the disc
+            there is no room for it at the box.
+        goal: how far the reward for the box's place reaches.
+
+    Attributes:
+        occluded, goal: the same.
+        place: where the box is to be brought, m.
+        place_over_disc: the same when `occluded`, m.
+        disc_radius: of the disc, m.
+    """
+
+    success_distance = GOAL_DISTANCE
+    place: Position
+    place_over_disc: Position
+    disc_radius: float
+
+    def __init__(
+        self,
+        occluded: bool = False,
+        starts: tuple[HandStart, ...] = ABOVE,
+        goal: GoalReward = "near",
+    ) -> None:
+        size = [BOX_HALF_SIZE] * 3
+        box = props.Primitive(geom_type="box", size=size, mass=BOX_MASS, rgba=_RED, name="box")
+        super().__init__(box, BOX_HALF_SIZE, self.place_over_disc if occluded else self.place)
+        self.occluded, self.goal, self._starts = occluded, goal, starts
+        self._furnish()
+        if occluded:
+            _add_disc(self._arena, self.disc_radius)
+
+    def _furnish(self) -> None:
+        """Add what else the scene has; nothing, unless a task says so."""
+
+    def distance(self, physics: mjcf.Physics) -> float:
+        """From the box to its target, m."""
+        return self.goal_distance(physics)
+
+    def initialize_episode(
+        self, physics: mjcf.Physics, random_state: np.random.RandomState
+    ) -> None:
+        """As every task, then the hand to the box where it starts there."""
+        super().initialize_episode(physics, random_state)
+        if self._starts == ABOVE:  # dm_control's draws, and no other
+            return
+        start = self._starts[random_state.randint(len(self._starts))]
+        if start == "above":
+            return
+        if self._place_hand_around_box(physics, random_state) and start == "holding":
+            self._close_fingers(physics)
+
+    def _place_hand_around_box(
+        self, physics: mjcf.Physics, random_state: np.random.RandomState
+    ) -> bool:
+        joints = physics.bind([*self.arm.joints, *self.hand.joints])
+        above, prop = np.array(joints.qpos), np.array(physics.bind(self._prop_frame).xpos)
+        place_hand = initializers.ToolCenterPointInitializer(
+            self.hand,
+            self.arm,
+            position=distributions.Uniform(*(np.array(AROUND_BOX) + prop)),
+            quaternion=workspaces.DOWN_QUATERNION,
+        )
+        for _ in range(ATTEMPTS):
+            self.hand.set_grasp(physics, random_state.uniform(*CLOSED_AROUND_BOX))
+            with suppress(composer.EpisodeInitializationError), quiet_inverse_kinematics():
+                place_hand(physics, random_state)
+                if not self._hand_touches_box(physics):
+                    return True
+        joints.qpos = above
+        return False
+
+    def _close_fingers(self, physics: mjcf.Physics) -> None:
+        velocities = np.zeros(physics.model.nu)
+        velocities[-len(self.hand.joints) :] = CLOSING_VELOCITY
+        physics.set_control(velocities)
+        physics.step(CLOSING_STEPS * self.physics_steps_per_control_step)
+        physics.set_control(np.zeros(physics.model.nu))
+
+    def _hand_touches_box(self, physics: mjcf.Physics) -> bool:
+        body, floor = physics.model.geom_bodyid, 0
+        for contact in physics.data.contact:
+            bodies = {int(body[contact.geom1]), int(body[contact.geom2])}
+            if contact.dist <= 0 and self._prop_body in bodies and floor not in bodies:
+                return True
+        return False
 
 
-def add_disc(arena: composer.Arena, radius: float) -> None:
+def _add_disc(arena: composer.Arena, radius: float) -> None:
     """Fix a solid disc between the camera and the middle of the workspace.
 
     Args:

@@ -8,7 +8,6 @@ workspace, z points up, and the camera looks along +y at the arm, which stands b
 from __future__ import annotations
 
 from abc import abstractmethod
-from contextlib import suppress
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -32,10 +31,6 @@ CAMERA = cameras.FRONT_CLOSE
 
 ProprioSet = Literal["paper", "full"]
 StateSet = Literal["absolute", "relative"]
-HandStart = Literal["above", "around", "holding"]
-"""Where the hand starts: in `HAND_SPAWN`, open around the object, or closed around it."""
-ABOVE: tuple[HandStart, ...] = ("above",)
-"""dm_control's start."""
 PROPRIO_SIZES: dict[ProprioSet, int] = {"paper": 24, "full": 42}
 """How many numbers each set of proprioception has; see `JacoTask.proprio`."""
 _POSE_AND_VELOCITY = ("position", "orientation", "linear_velocity", "angular_velocity")
@@ -61,34 +56,16 @@ OBJECT_SPAWN = Box((-0.1, -0.1, 0.001), (0.1, 0.1, 0.001))
 whose objects have their origin there)."""
 
 
-AROUND_OBJECT = Box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.02))
-"""Where the tool centre point starts around the object, from the object's origin, m."""
-CLOSED_AROUND_OBJECT = (0.2, 0.6)
-"""By which share the fingers are closed there, at least and at most: nearer than they open, and not
-yet at a box of 5 cm."""
-ATTEMPTS_AROUND_OBJECT = 20
-"""To draw a start around the object in which the hand touches nothing."""
-CLOSING_VELOCITY = 1.0
-"""Of the fingers that close around the object before an episode begins, rad/s."""
-CLOSING_STEPS = 20
-"""For so many control steps: from the widest start the fingers are closed before."""
-
-
 class JacoTask(composer.Task):  # type: ignore[misc]
     """An arm, a hand and one free object; a task adds what it rewards.
 
     In every episode the hand starts at random in `HAND_SPAWN`, pointing down with its fingers
-    closed by a random amount, and the object lies at random in `OBJECT_SPAWN`. That is the start
-    `above`. In the start `around` the hand is then moved to the object, to a place drawn from
-    `AROUND_OBJECT` and with its fingers closed by a share of `CLOSED_AROUND_OBJECT`, where it
-    touches nothing; should none be found, which is rare, it stays where it was. In the start
-    `holding` the fingers have closed from there, and hold the object, which is on the floor.
+    closed by a random amount, and the object lies at random in `OBJECT_SPAWN`.
 
     Args:
         prop: the object.
         prop_height: of its origin above its lower face, m.
         target: where the object is to be brought, m; None where the object itself is the target.
-        starts: where the hand starts; of several, one is drawn in each episode.
 
     Attributes:
         arm: the Jaco arm, six velocity-controlled joints.
@@ -97,21 +74,15 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         target: where the object is to be brought, (3,), m, or None.
         term_names: the names of the reward's terms.
         success_distance: the task is solved when `distance` is at most this, m.
-        starts: where the hand starts.
     """
 
     term_names: tuple[str, ...]
     success_distance: float
 
     def __init__(
-        self,
-        prop: composer.Entity,
-        prop_height: float = 0.0,
-        target: Position | None = None,
-        starts: tuple[HandStart, ...] = ABOVE,
+        self, prop: composer.Entity, prop_height: float = 0.0, target: Position | None = None
     ) -> None:
         self.target = None if target is None else np.array(target)
-        self.starts = starts
         self._arena = arenas.Standard()
         self.arm = kinova.JacoArm()
         self.hand = kinova.JacoHand(use_pinch_site_as_tcp=True)
@@ -184,48 +155,6 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         with quiet_inverse_kinematics():
             self._place_hand(physics, random_state)
         self._place_prop(physics, random_state)
-        if self.starts == ABOVE:  # dm_control's draws, and no other
-            return
-        start = self.starts[random_state.randint(len(self.starts))]
-        if start == "above":
-            return
-        if self._place_hand_around_prop(physics, random_state) and start == "holding":
-            self._close_fingers(physics)
-
-    def _place_hand_around_prop(
-        self, physics: mjcf.Physics, random_state: np.random.RandomState
-    ) -> bool:
-        joints = physics.bind([*self.arm.joints, *self.hand.joints])
-        above, prop = np.array(joints.qpos), np.array(physics.bind(self._prop_frame).xpos)
-        place_hand = initializers.ToolCenterPointInitializer(
-            self.hand,
-            self.arm,
-            position=distributions.Uniform(*(np.array(AROUND_OBJECT) + prop)),
-            quaternion=workspaces.DOWN_QUATERNION,
-        )
-        for _ in range(ATTEMPTS_AROUND_OBJECT):
-            self.hand.set_grasp(physics, random_state.uniform(*CLOSED_AROUND_OBJECT))
-            with suppress(composer.EpisodeInitializationError), quiet_inverse_kinematics():
-                place_hand(physics, random_state)
-                if not self._hand_touches_prop(physics):
-                    return True
-        joints.qpos = above
-        return False
-
-    def _close_fingers(self, physics: mjcf.Physics) -> None:
-        velocities = np.zeros(physics.model.nu)
-        velocities[-len(self.hand.joints) :] = CLOSING_VELOCITY
-        physics.set_control(velocities)
-        physics.step(CLOSING_STEPS * self.physics_steps_per_control_step)
-        physics.set_control(np.zeros(physics.model.nu))
-
-    def _hand_touches_prop(self, physics: mjcf.Physics) -> bool:
-        body, floor = physics.model.geom_bodyid, 0
-        for contact in physics.data.contact:
-            bodies = {int(body[contact.geom1]), int(body[contact.geom2])}
-            if contact.dist <= 0 and self._prop_body in bodies and floor not in bodies:
-                return True
-        return False
 
     def tool_center_point(self, physics: mjcf.Physics) -> NDArray[np.float64]:
         """Where the fingers meet, (3,), m."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dm_control import mjcf
 
 from merl.tasks import rewards
-from merl.tasks.box import BOX_HALF_SIZE, add_disc, make_box
-from merl.tasks.jaco import ABOVE, HandStart, JacoTask
+from merl.tasks.box import BOX_HALF_SIZE, BoxTask
 
 TARGET = (0.0, -0.2, BOX_HALF_SIZE)
 """Where the centre of the box is to be, m: on the floor, nearer to the camera than it starts."""
@@ -19,29 +18,14 @@ DISC_RADIUS = 0.085
 _GREEN = (0.0, 0.8, 0.0, 1.0)
 
 
-class MoveBox(JacoTask):
-    """Bring a cube to within 1 cm of a place on the floor (MERL B.1, Eq. 4).
-
-    Args:
-        occluded: put a disc between camera and box.
-        starts: where the hand starts; under the disc there is no room for it around the box.
-        goal: how far the reward for the box's place reaches.
-
-    Attributes:
-        goal: the same.
-    """
+class MoveBox(BoxTask):
+    """Bring a cube to within 1 cm of a place on the floor (MERL B.1, Eq. 4)."""
 
     term_names = ("reaching", "pushing")
-    success_distance = rewards.GOAL_DISTANCE
+    place = place_over_disc = TARGET
+    disc_radius = DISC_RADIUS
 
-    def __init__(
-        self,
-        occluded: bool = False,
-        starts: tuple[HandStart, ...] = ABOVE,
-        goal: rewards.GoalReward = "near",
-    ) -> None:
-        super().__init__(make_box(), BOX_HALF_SIZE, TARGET, starts)
-        self.goal = goal
+    def _furnish(self) -> None:
         # An opaque patch that touches nothing: the ray tracer draws neither sites nor transparency.
         self._arena.mjcf_model.worldbody.add(
             "geom",
@@ -53,12 +37,6 @@ class MoveBox(JacoTask):
             contype=0,
             conaffinity=0,
         )
-        if occluded:
-            add_disc(self._arena, DISC_RADIUS)
-
-    def distance(self, physics: mjcf.Physics) -> float:
-        """From the box to its target, m."""
-        return self.goal_distance(physics)
 
     def reward_terms(self, physics: mjcf.Physics) -> rewards.Terms:
         """Eq. 4: `reaching` and `pushing`, each in [0, 1/2]."""

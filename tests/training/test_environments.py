@@ -72,6 +72,13 @@ def test_a_run_with_workers_is_reproducible_and_keeps_its_ratio(
     np.testing.assert_allclose(metrics["train/reward/first"], metrics["train/return"], rtol=1e-6)
 
 
+def test_what_environments_tell_is_not_mixed(tmp_path: Path) -> None:
+    assert train(tmp_path / "run", "uneven", "--num-envs", "3") == 0
+    metrics = read_metrics(tmp_path / "run")
+    assert np.nanmin(metrics["train/return"]) > 0
+    np.testing.assert_allclose(metrics["train/reward/first"], metrics["train/return"], rtol=1e-6)
+
+
 def test_each_worker_meets_other_episodes_and_has_a_lane_of_its_own(tmp_path: Path) -> None:
     assert train(tmp_path / "run", "plain", "--num-envs", "2") == 0
     seen = [

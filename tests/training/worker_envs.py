@@ -99,6 +99,20 @@ def stillborn() -> Plain:
     return Stillborn()
 
 
+class Uneven(Plain):
+    """What it tells changes in kind from step to step: a term is a whole number at times."""
+
+    def step(self, action: Any) -> Any:
+        seen, reward, terminated, truncated, _ = super().step(action)
+        reward = max(reward, 0.0)
+        info = {"reward_terms": {"first": reward if reward else 0}}
+        return seen, reward, terminated, truncated, info
+
+
+def uneven() -> Plain:
+    return Uneven()
+
+
 def fails() -> Plain:
     return Failing()
 

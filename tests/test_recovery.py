@@ -190,6 +190,21 @@ def test_the_same_line_begins_goes_on_and_is_done(
     assert "no whole checkpoint" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("how", ["train", "resume"])
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins(tmp_path: Path, how: str) -> None:
+    folder = tmp_path / "run"
+    assert main(line(folder, "--steps", "100")) == 0
+    shutil.rmtree(folder / "checkpoints")  # what a kill leaves behind between the two
+    (folder / "metrics.csv").write_text("step\n")
+    (folder / "checkpoints" / ".part-00000000").mkdir(parents=True)
+    on = line(folder, "--resume", "--steps", "200") if how == "train" else ["resume", str(folder)]
+    assert main(on) == 0
+    steps = read_metrics(folder)["step"]
+    assert steps[0] == EPISODE
+    assert steps[-1] == saved(folder)[-1] == (200 if how == "train" else 100)
+    assert main(["resume", str(folder), "--steps", "220"]) == 0
+
+
 def test_a_soak_for_half_a_minute(tmp_path: Path) -> None:
     """`docs/measure_soak.py` goes on for two hours."""
     without_end = ["--steps", "100000000", "--updates-per-step", "0.1"]

@@ -88,6 +88,14 @@ def test_keeps_the_last_and_the_best(tmp_path: Path) -> None:
     assert Checkpoint.find(tmp_path, "400").step == 400
 
 
+def test_a_second_save_at_a_step_replaces_the_first(tmp_path: Path) -> None:
+    save(tmp_path, 100, agent(), {"a": 1}, score=None, keep=1)
+    save(tmp_path, 100, agent(), {"a": 2}, score=3.0, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["00000100"]
+    found = Checkpoint.find(tmp_path)
+    assert (found.score, found.state()) == (3.0, {"a": 2})
+
+
 def test_going_on_from_before_a_damaged_one_never_loses_the_good_ones(tmp_path: Path) -> None:
     for step in (100, 300):
         save(tmp_path, step, agent(), {}, score=float(step), keep=2)

@@ -184,6 +184,45 @@ def test_a_signal_to_all_processes_saves(tmp_path: Path, number: int) -> None:
     assert cli.main(["resume", str(run), "--minutes", "0.02"]) == 0
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_workers_start_ends_it_at_once(tmp_path: Path, number: int) -> None:
+    run = tmp_path / "run"
+    line = ["train", "worker_envs:never_ready", *SMALL, "--num-envs", "2", "--run-dir", str(run)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "merl.cli", *line],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not (tmp_path / "waits").exists() and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 128 + number
+    assert "stopped before training began: nothing was written" in out
+    assert "Traceback" not in err
+    assert not run.exists()
+
+
+def test_other_processes_of_the_caller_are_left_alone(tmp_path: Path) -> None:
+    bystander = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
+    bystander.start()
+    assert train(tmp_path / "run", "stillborn", "--no-synchronous", "--worker-restarts", "1") == 4
+    assert multiprocessing.active_children() == [bystander]
+    bystander.kill()
+    bystander.join()
+
+
+@pytest.mark.parametrize("flags", [(), ("--no-synchronous",)])
+@pytest.mark.parametrize("which", ["plain", "of_its_own"])
+def test_who_cannot_be_resumed_exactly_is_told(
+    tmp_path: Path, which: str, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", which, *flags) == 0
+    told = "a resumed run will meet other episodes" in " ".join(capsys.readouterr().out.split())
+    assert told == (which == "of_its_own")
+
+
 def test_an_error_that_cannot_be_sent_ends_the_run(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="LocalError: the gripper is gone"):
         train(tmp_path / "run", "fails", "--num-envs", "2")

@@ -113,6 +113,35 @@ def uneven() -> Plain:
     return Uneven()
 
 
+class NeverReady(Plain):
+    """Cannot be made in a process of its own: whoever waits for it waits."""
+
+    def __init__(self) -> None:
+        if multiprocessing.parent_process() is not None:
+            (Path(os.environ["TURNS"]) / "waits").touch()
+            time.sleep(1000)
+
+
+class OfItsOwn(Plain):
+    """Leaves Gymnasium's generator alone."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.generator = np.random.default_rng(seed)
+        self.taken = 0
+        return self._seen(), {}
+
+    def _seen(self) -> Any:
+        return self.generator.normal(size=3).astype(np.float32)
+
+
+def never_ready() -> Plain:
+    return NeverReady()
+
+
+def of_its_own() -> Plain:
+    return OfItsOwn()
+
+
 def fails() -> Plain:
     return Failing()
 

@@ -48,6 +48,8 @@ def go_on(run: Run, asked: TrainConfig) -> int:
         agent = dataclasses.replace(config.agent, precision="auto")
         config = dataclasses.replace(config, threads=None, agent=agent)
     with run.lock():
+        if run.begin_again():
+            return _train(config, f"run {run.path} was ended before its first step", (run, None))
         start = Checkpoint.find(run.checkpoints)
         state = start.state()
         if config.steps < min(start.step, run.config.steps):
@@ -66,19 +68,21 @@ def go_on(run: Run, asked: TrainConfig) -> int:
         return _train(config, what, (run, start))
 
 
-def _train(config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint] | None = None) -> int:
+def _train(
+    config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint | None] | None = None
+) -> int:
     console = Console()
     with ExitStack() as stack:
         try:
             with console.status("building the scene and timing this machine"):
                 trainer = stack.enter_context(Trainer.prepare(config, new=resumed is None))
-        except KeyboardInterrupt:
+            done = resumed[1].step if resumed and resumed[1] else 0
+            console.print(_outlook(trainer, what, done), highlight=False)
+            with ConsoleView(console) as view:
+                outcome = trainer.resume(*resumed, view) if resumed else trainer.start(view)
+        except KeyboardInterrupt:  # from there on a signal is a wish, see `Interrupt`
             console.print("stopped before training began: nothing was written")
             raise
-        done = resumed[1].step if resumed else 0
-        console.print(_outlook(trainer, what, done), highlight=False)
-        with ConsoleView(console) as view:
-            outcome = trainer.resume(*resumed, view) if resumed else trainer.start(view)
     folder = outcome.run.path
     if outcome.signal is not None:
         stopped = f"stopped at step {outcome.progress.step:,}"

@@ -9,9 +9,10 @@ from __future__ import annotations
 import multiprocessing
 import pickle
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
 from threading import Timer
 from typing import Any, NamedTuple, Protocol
 
@@ -247,14 +248,22 @@ class Workers:
     def _started(self) -> AsyncVectorEnv:
         self._lost = None
         makers = [_Maker(self._config, index, self._here) for index in range(self.count)]
-        with self._loss(), _killing_after(START_SECONDS):
+        others = multiprocessing.active_children()
+        with (
+            self._loss(),
+            _killing_after(
+                START_SECONDS, lambda: set(multiprocessing.active_children()) - {*others}
+            ),
+        ):
             return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
 
 
 @contextmanager
-def _killing_after(seconds: float) -> Iterator[None]:
-    """Kill every process of this one's if the work takes longer: whoever waits for them goes on."""
-    impatience = Timer(seconds, _kill)
+def _killing_after(
+    seconds: float, processes: Callable[[], Iterable[BaseProcess]]
+) -> Iterator[None]:
+    """Kill processes if the work takes longer: whoever waits for them goes on."""
+    impatience = Timer(seconds, lambda: _kill(processes()))
     impatience.daemon = True
     impatience.start()
     try:
@@ -263,18 +272,18 @@ def _killing_after(seconds: float) -> Iterator[None]:
         impatience.cancel()
 
 
-def _kill() -> None:
-    for process in multiprocessing.active_children():
+def _kill(processes: Iterable[BaseProcess]) -> None:
+    for process in processes:
         process.kill()
 
 
 def _end(env: AsyncVectorEnv) -> None:
     """End the processes, whatever state they are in."""
-    with _killing_after(END_SECONDS):
+    with _killing_after(END_SECONDS, lambda: env.processes):
         try:
             env.close()
         except Exception:  # a pipe or a process is gone: no way to end in good order
-            _kill()
+            _kill(env.processes)
             env._state = AsyncState.DEFAULT  # nothing will answer what it waits for
             with suppress(Exception):
                 env.close(terminate=True)

@@ -154,7 +154,8 @@ def save(
         for path in (*part.iterdir(), part):
             _sync(path)
         final = root / f"{step:08d}"
-        shutil.rmtree(final, ignore_errors=True)
+        if final.exists():  # there until the very moment at which the new one takes its place
+            final.rename(root / f".part-{step:08d}-former")
         part.rename(final)
         _sync(root)
     except BaseException:

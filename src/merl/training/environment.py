@@ -69,7 +69,8 @@ def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
 
     Without it a run that is resumed meets other episodes than it would have met.
     """
-    generator = getattr(env.unwrapped, "np_random", None)
+    # Gymnasium's `np_random` makes a generator for whoever asks, this is one that is in use.
+    generator = getattr(env.unwrapped, "_np_random", None)
     if not isinstance(generator, np.random.Generator):
         return None
     state: dict[str, Any] = dict(generator.bit_generator.state)

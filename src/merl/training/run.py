@@ -35,7 +35,7 @@ from gymnasium import spaces
 
 import merl
 from merl.agents import AGENTS
-from merl.core import CONFIG_FILE, MerlError, check_choice
+from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
 from merl.envs.own import module_folder, search_also
 from merl.training.config import TrainConfig
 
@@ -130,6 +130,20 @@ class Run:
     def has_moved(self) -> bool:
         """Whether it was trained last on another machine than this one."""
         return _last_machine(_read(self.path)) != machine()
+
+    def begin_again(self) -> bool:
+        """Clear the folder for a first step, if it was left before its first checkpoint.
+
+        Returns:
+            Whether it is so; a run that has saved or measured anything is left as it is.
+        """
+        metrics = self.path / METRICS_FILE
+        has_rows = metrics.exists() and metrics.read_bytes().count(b"\n") > 1
+        if has_rows or any(path.name.isdigit() for path in self.checkpoints.glob("*")):
+            return False
+        for folder in (self.replay, self.checkpoints):
+            shutil.rmtree(folder, ignore_errors=True)
+        return True
 
     def check_there(self) -> None:
         """Before anything is written, lest a folder that was taken away be made anew.

@@ -18,6 +18,18 @@ _APART = 0.1
 same one twice, to the process and to its group."""
 
 
+class Stopped(KeyboardInterrupt):
+    """A signal came where there is nothing to save yet.
+
+    Attributes:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
 @dataclass
 class Interrupt:
     """A wish to stop, by a signal; a second one stops at once.
@@ -28,6 +40,7 @@ class Interrupt:
 
     number: int | None = None
     _at: float = 0.0
+    _raises: bool = False
 
     @contextmanager
     def listening(self) -> Iterator[Interrupt]:
@@ -43,9 +56,20 @@ class Interrupt:
             for number, handler in former.items():
                 signal.signal(number, handler)
 
+    @contextmanager
+    def raising(self) -> Iterator[None]:
+        """Have the first signal raise `Stopped` in here, where no safe point comes for long."""
+        self._raises = True
+        try:
+            yield
+        finally:
+            self._raises = False
+
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self.number is None:
             self.number, self._at = number, time.monotonic()
+            if self._raises:
+                raise Stopped(number)
         # A closed terminal sends SIGHUP twice, and saving takes a moment.
         elif number != signal.SIGHUP and time.monotonic() - self._at > _APART:
             if sys.stdout.isatty():  # the live view hides it

@@ -173,9 +173,12 @@ class Trainer:
                 shutil.rmtree(run.path, ignore_errors=True)
             raise
 
-    def resume(self, run: Run, start: Checkpoint, view: View) -> Outcome:
-        """Go on from a checkpoint of the run, whose lock the caller holds."""
-        return self._run(dataclasses.replace(run, config=self.config), start, view)
+    def resume(self, run: Run, start: Checkpoint | None, view: View) -> Outcome:
+        """Go on from a checkpoint of the run, or begin it; the caller holds its lock."""
+        run = dataclasses.replace(run, config=self.config)
+        if start is None:
+            run.record_resumption(0)
+        return self._run(run, start, view)
 
     def _run(self, run: Run, start: Checkpoint | None, view: View) -> Outcome:
         with ExitStack() as stack:
@@ -190,7 +193,8 @@ class Trainer:
                 directory=run.replay,
                 capacity=config.capacity,
             )
-            environments = Workers(config, self.env) if config.has_workers else Here(self.env)
+            with interrupt.raising():
+                environments = Workers(config, self.env) if config.has_workers else Here(self.env)
             stack.callback(environments.close)
             stretch = _Stretch(self, run, replay, environments, metrics, view, interrupt)
             if start is not None:
@@ -237,15 +241,17 @@ class _Stretch:
         self.view.begin(self.run, trainer)
         if not trainer.films and self.config.eval.video != "none":
             self.view.warn("there will be no videos: the environment does not render to an array")
-        if None in self._environment_states():
-            self.view.warn(
-                "a resumed run will meet other episodes than this one would: the environment does "
-                "not draw from Gymnasium's np_random"
-            )
         if progress.step == 0:
             self._save()  # from here on there is something to go on from
         self.clock.mark(progress)
-        for moment in train(stage, trainer.agent, progress, trainer.randomness, self.config):
+        for count, moment in enumerate(
+            train(stage, trainer.agent, progress, trainer.randomness, self.config)
+        ):
+            if count == 0 and not moment.lost and None in self._environment_states():
+                self.view.warn(
+                    "a resumed run will meet other episodes than this one would: the environment "
+                    "does not draw from Gymnasium's np_random"
+                )
             self.guard.watch(moment.learning, moment.step)
             self.averages.add(moment.learning)
             if moment.lost and not self._is_to_stop():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import signal
 import subprocess
 import sys
@@ -12,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_recovery import EPISODE, line, saved, start
 
 from merl.cli import main
 from merl.report.curves import read_metrics
 from merl.training.checkpoint import Checkpoint
+from test_recovery import EPISODE, line, saved, start
 
 SIZE = 24 * 2**20
 """Of the disk, in bytes: a few checkpoints of the dot, its replay and its videos."""
@@ -53,17 +52,16 @@ def fill(folder: Path) -> Path:
                 while True:
                     file.write(bytes(size))
             except OSError as error:
-                assert error.errno == errno.ENOSPC
+                if error.errno != errno.ENOSPC:
+                    raise
     return filler
 
 
 def check_alone(folder: Path) -> None:
-    subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "tmpfs", str(folder)], check=True
-    )
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "tmpfs", str(folder)], check=True)
     run = folder / "run"
-    often = ["--eval.every", "60", "--eval.video", "each", "--steps", "1000000", "--replay.capacity", "1000"]
-    process = start(line(run, *often))
+    often = ["--eval.every", "60", "--eval.video", "each"]
+    process = start(line(run, *often, "--steps", "1000000", "--replay.capacity", "1000"))
     assert process.stdout is not None
     wait_for(lambda: len(saved(run)) > 1, process)
     filler = fill(folder)

@@ -3,15 +3,14 @@
 import numpy as np
 
 from merl.tasks import jaco, make_task
-from merl.tasks.box import ABOVE
 
 
 class Episodes:
     """A task, started in the way of `JacoEnv`: one physics for all episodes."""
 
-    def __init__(self, name, occluded=False, starts=ABOVE):
+    def __init__(self, name, occluded=False, **form):
         self.name, self.occluded = name, occluded
-        self.task = make_task(name, occluded=occluded, starts=starts)
+        self.task = make_task(name, occluded=occluded, **form)
         self.physics = self.task.compile()
 
     def start(self, seed):

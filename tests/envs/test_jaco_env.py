@@ -254,5 +254,6 @@ def test_every_setting_is_a_plain_value():
         "occluded": False,
         "start": ("above",),
         "goal_reward": "near",
+        "floor": "rough",
         "render_size": 480,
     }

@@ -36,6 +36,8 @@ def test_a_task_of_ones_own_has_none():
     assert references("my_package:make_env") == ()
 
 
-@pytest.mark.parametrize("form", [EnvConfig(start=("around",)), EnvConfig(goal_reward="far")])
+@pytest.mark.parametrize(
+    "form", [EnvConfig(start=("around",)), EnvConfig(goal_reward="far"), EnvConfig(floor="smooth")]
+)
 def test_a_form_that_was_not_measured_has_none(form):
     assert references("move_box", form) == ()

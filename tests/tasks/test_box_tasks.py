@@ -204,6 +204,8 @@ def test_tasks_by_name():
         make_task("reach_duplo", occluded=True)
     with pytest.raises(MerlError, match="is solved where the hand starts around"):
         make_task("reach_duplo", starts=("around",))
+    with pytest.raises(MerlError, match="reach_duplo has a rough floor"):
+        make_task("reach_duplo", floor="smooth")
     with pytest.raises(MerlError, match="occluded needs --start above"):
         make_task("lift_box", occluded=True, starts=("around",))
 
@@ -246,6 +248,18 @@ def test_the_hand_can_start_with_the_box_in_it(name):
             physics.step(task.physics_steps_per_control_step)
         follows.append(task.prop_position(physics)[2] - BOX_HALF_SIZE > 0.03)
     assert np.mean(follows) >= 0.8
+
+
+@pytest.mark.parametrize(("floor", "friction"), [("rough", 1.0), ("smooth", 0.2)])
+def test_how_far_a_box_slides_is_a_matter_of_the_floor(floor, friction):
+    """At 0.5 m/s it comes to rest after v^2 / (2 mu g)."""
+    episodes, speed = Episodes("move_box", floor=floor), 0.5
+    physics = episodes.start(0)
+    before = episodes.task.prop_position(physics)
+    physics.data.qvel[-6] = speed
+    physics.step(500)
+    slid = np.linalg.norm(episodes.task.prop_position(physics) - before)
+    assert slid == pytest.approx(speed**2 / (2 * friction * 9.81), rel=0.25)
 
 
 def test_of_several_starts_one_is_drawn():

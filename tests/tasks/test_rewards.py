@@ -1,6 +1,7 @@
 """Eqs. 3 to 5 at points computed by hand, at both sides of every gate, and within their bounds."""
 
 import itertools
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -59,6 +60,14 @@ def test_a_goal_that_is_seen_from_afar(distance: float, share: float) -> None:
     lifted = rewards.lift(NEAR, 1.0, 0.0351, 0.18, distance, goal="far")
     assert lifted["lifting"] == pytest.approx(share / 4, abs=1e-6)
     assert rewards.lift(NEAR, 1.0, 0.035, 0.18, distance, goal="far")["lifting"] == 0.0
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.01, 0.03, 0.06, 0.2, 0.5])
+def test_a_goal_that_is_seen_from_afar_and_from_near(distance: float) -> None:
+    near, far, both = (
+        rewards.move(NEAR, distance, goal=goal)["pushing"] for goal in get_args(rewards.GoalReward)
+    )
+    assert both == pytest.approx((near + far) / 2)
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,10 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
     from merl.tasks import make_task
 
     scene = make_task(
-        task, occluded=settings.occluded, starts=settings.start, goal=settings.goal_reward
+        task,
+        occluded=settings.occluded,
+        starts=settings.start,
+        goal=settings.goal_reward,
+        floor=settings.floor,
     )
     return JacoEnv(scene, settings, render_mode)

@@ -11,7 +11,8 @@ RendererName = Literal["gl", "warp"]
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
-GoalRewardName = Literal["near", "far"]
+GoalRewardName = Literal["near", "far", "both"]
+FloorName = Literal["rough", "smooth"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 
@@ -49,7 +50,12 @@ class EnvConfig:
 
     goal_reward: GoalRewardName = "near"
     """How far the reward for the box's place reaches, in `move_box` and `lift_box`: `near` (a long
-    tail, to a tenth 5 cm away) or `far` (a straight line, to nothing 30 cm away)."""
+    tail, to a tenth 5 cm away), `far` (a straight line, to nothing 30 cm away) or `both` (their
+    mean)."""
+
+    floor: FloorName = "rough"
+    """In `move_box` and `lift_box`: `rough` (dm_control's, a friction of 1) or `smooth` (0.2, for
+    all that touches it: box and fingers slide rather than stick)."""
 
     render_size: int = 480
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
@@ -59,6 +65,7 @@ class EnvConfig:
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
         check_choice("goal_reward", self.goal_reward, get_args(GoalRewardName))
+        check_choice("floor", self.floor, get_args(FloorName))
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
                 f"observations is {self.observations!r}: give a tuple of at least one of "

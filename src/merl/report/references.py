@@ -38,10 +38,10 @@ def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]
 
     Args:
         task: the task's name.
-        env: its form: occluded or not; with other starts or another reward none were measured.
+        env: its form: occluded or not; of the others none were measured.
     """
     form, plain = env or EnvConfig(), EnvConfig()
-    if (form.start, form.goal_reward) != (plain.start, plain.goal_reward):
+    if any(getattr(form, name) != getattr(plain, name) for name in UNMEASURED):
         return ()
     rows = _measured().get(task + OCCLUDED * form.occluded, [])
     return tuple(
@@ -57,6 +57,10 @@ def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]
 
 OCCLUDED = " occluded"
 """What is added to a task's name for its occluded form."""
+
+
+UNMEASURED = ("start", "goal_reward", "floor")
+"""Fields of `EnvConfig` that make a task another one, for which there are no references."""
 
 
 @cache

@@ -8,7 +8,7 @@ from merl.core import MerlError, meant
 from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
 
 # isort: split
-from merl.tasks.box import ABOVE, BoxTask, HandStart
+from merl.tasks.box import ABOVE, BoxTask, Floor, HandStart
 from merl.tasks.jaco import JacoTask
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
@@ -18,6 +18,7 @@ from merl.tasks.rewards import GoalReward
 __all__ = [
     "BOX_TASKS",
     "TASKS",
+    "Floor",
     "GoalReward",
     "HandStart",
     "JacoTask",
@@ -41,6 +42,7 @@ def make_task(
     occluded: bool = False,
     starts: tuple[HandStart, ...] = ABOVE,
     goal: GoalReward = "near",
+    floor: Floor = "rough",
 ) -> JacoTask:
     """A task by its name.
 
@@ -49,6 +51,7 @@ def make_task(
         occluded: with a disc between camera and object.
         starts: where the hand starts; of several, one is drawn in each episode.
         goal: how far the reward for the object's place reaches, where it has one.
+        floor: how it lets a box slide.
 
     Raises:
         MerlError: there is no such task, or it has no such form.
@@ -60,7 +63,7 @@ def make_task(
             raise MerlError(
                 "under the disc the hand has no room at the box: occluded needs --start above"
             )
-        return BOX_TASKS[name](occluded=occluded, starts=starts, goal=goal)
+        return BOX_TASKS[name](occluded=occluded, starts=starts, goal=goal, floor=floor)
     if occluded:
         raise MerlError(f"{name} has no occluded form: choose from {', '.join(BOX_TASKS)}")
     if starts != ABOVE:
@@ -69,4 +72,6 @@ def make_task(
         )
     if goal != "near":
         raise MerlError(f"{name} brings nothing to a goal: only {', '.join(BOX_TASKS)} do")
+    if floor != "rough":
+        raise MerlError(f"{name} has a rough floor: only {', '.join(BOX_TASKS)} have another")
     return TASKS[name]()

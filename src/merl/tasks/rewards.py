@@ -28,8 +28,9 @@ VERTICAL_MARGIN = 0.99
 FLOATING_HEIGHT = 0.035
 """epsilon_floating: the object is off the floor when its centre is above this, m."""
 
-GoalReward = Literal["near", "far"]
-"""How far the reward for the object's place reaches: `GOAL_MARGIN` or `FAR_GOAL_MARGIN`."""
+GoalReward = Literal["near", "far", "both"]
+"""How far the reward for the object's place reaches: `GOAL_MARGIN`, `FAR_GOAL_MARGIN`, or the mean
+of the two, which tells from afar which way the goal is and still pays for the last centimetres."""
 Terms = dict[str, float]
 
 
@@ -112,10 +113,10 @@ def _near(distance: float) -> float:
 
 def _at_goal(distance: float, goal: GoalReward) -> float:
     bounds = (0.0, GOAL_DISTANCE)
-    if goal == "far":
-        linear = {"sigmoid": "linear", "value_at_margin": 0.0}
-        return float(tolerance(distance, bounds, margin=FAR_GOAL_MARGIN, **linear))
-    return float(tolerance(distance, bounds, margin=GOAL_MARGIN, sigmoid="long_tail"))
+    linear = {"sigmoid": "linear", "value_at_margin": 0.0}
+    near = float(tolerance(distance, bounds, margin=GOAL_MARGIN, sigmoid="long_tail"))
+    far = float(tolerance(distance, bounds, margin=FAR_GOAL_MARGIN, **linear))
+    return {"near": near, "far": far, "both": (near + far) / 2}[goal]
 
 
 def _upright(cosine: float, enough: float) -> float:

@@ -1,4 +1,4 @@
-"""A disk that is really full: a small one, mounted where nobody else sees it."""
+"""Disks that are full, or not to be written to: small ones, mounted where nobody else sees them."""
 
 from __future__ import annotations
 
@@ -30,17 +30,33 @@ def can_mount(folder: Path) -> bool:
         return False
 
 
-def test_a_full_disk_ends_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("which", ["full", "read_only"])
+def test_a_disk(which: str, tmp_path: Path) -> None:
     if not can_mount(tmp_path):
         pytest.skip("this system lets nobody mount a disk of their own")
     alone = subprocess.run(
-        [*ALONE, sys.executable, __file__, str(tmp_path)],
+        [*ALONE, sys.executable, __file__, which, str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,
         timeout=240,
     )
     assert alone.returncode == 0, alone.stdout + alone.stderr
+
+
+def read_only(folder: Path) -> None:
+    """Refused before anything is timed or built, and by name; what is there can be evaluated."""
+    mount(folder)
+    assert main(line(folder / "run", "--steps", "100")) == 0
+    mount(folder, "remount,ro")
+    for arguments in (line(folder / "other"), ["resume", str(folder / "run"), "--steps", "200"]):
+        process = start(arguments)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 2, err
+        assert err.count("\n") == 1
+        assert "Read-only file system" in err
+        assert str(folder) in err
+    assert main(["evaluate", str(folder / "run"), "--episodes", "1"]) == 0
 
 
 def fill(folder: Path) -> Path:
@@ -57,15 +73,20 @@ def fill(folder: Path) -> Path:
     return filler
 
 
-def check_alone(folder: Path) -> None:
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "tmpfs", str(folder)], check=True)
+def mount(folder: Path, options: str = f"size={SIZE}") -> None:
+    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], check=True)
+
+
+def full(folder: Path) -> None:
+    """The run goes on, says what was not written, and has lost nothing once there is room."""
+    mount(folder)
     run = folder / "run"
     often = ["--eval.every", "60", "--eval.video", "each"]
     process = start(line(run, *often, "--steps", "1000000", "--replay.capacity", "1000"))
     assert process.stdout is not None
     wait_for(lambda: len(saved(run)) > 1, process)
     filler = fill(folder)
-    full = saved(run)[-1]
+    before = saved(run)[-1]
     told = []
     for said in process.stdout:
         told.append(said)
@@ -74,14 +95,14 @@ def check_alone(folder: Path) -> None:
     time.sleep(3)  # it goes on, and what it has to say it keeps
     assert process.poll() is None, told
     filler.unlink()
-    wait_for(lambda: saved(run)[-1] > full, process)
+    wait_for(lambda: saved(run)[-1] > before, process)
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM, err
     assert "Traceback" not in err
 
     last = Checkpoint.find(run / "checkpoints").step
-    assert last > full
+    assert last > before
     assert main(["resume", str(run), "--steps", str(last + 2 * EPISODE)]) == 0
     steps = read_metrics(run)["step"]
     assert (np.diff(steps) < 2 * EPISODE).all(), "a row is missing"  # one episode was cut off
@@ -99,4 +120,4 @@ def wait_for(happens: object, process: subprocess.Popen[str]) -> None:
 
 
 if __name__ == "__main__":
-    check_alone(Path(sys.argv[1]))
+    {"full": full, "read_only": read_only}[sys.argv[1]](Path(sys.argv[2]))

@@ -1,8 +1,9 @@
 """Measure what returns are compared with: random actions, no motion, the expert.
 
-python docs/measure_references.py [EPISODES]
+python docs/measure_references.py [EPISODES [FORM ...]]
 
-Writes src/merl/report/references.json. No picture is drawn, so the renderer does not matter.
+Writes src/merl/report/references.json, all of it or the forms that are named ("lift_box occluded").
+No picture is drawn, so the renderer does not matter.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from merl.envs import make_env
+from merl.envs import EnvConfig, make_env
 from merl.envs.expert import ExpertPolicy
-from merl.report.references import OCCLUDED
+from merl.report.references import form
 from merl.tasks import BOX_TASKS, TASKS
 from merl.training.evaluation import Evaluation, evaluate
 
@@ -32,9 +34,18 @@ PUBLISHED = {
 }
 
 
-def measure(task: str, occluded: bool, episodes: int) -> list[dict[str, object]]:
-    """The rows of one task."""
-    env = make_env(task, renderer="warp", observations=("proprio",), occluded=occluded)
+EASIER = {"start": ("around", "holding"), "goal_reward": "both", "floor": "smooth"}
+"""What is learnt from the state (docs/tasks.md)."""
+FORMS: list[tuple[str, dict[str, Any]]] = [
+    *((task, {}) for task in TASKS),
+    *((task, {"occluded": True}) for task in BOX_TASKS),
+    *((task, EASIER) for task in BOX_TASKS),
+]
+
+
+def measure(task: str, settings: dict[str, Any], episodes: int) -> list[dict[str, object]]:
+    """The rows of one task in one form."""
+    env = make_env(task, renderer="warp", observations=("proprio",), **settings)
     rng = np.random.default_rng(0)
     expert = ExpertPolicy(env)
     policies = {
@@ -45,7 +56,7 @@ def measure(task: str, occluded: bool, episodes: int) -> list[dict[str, object]]
     rows = []
     for name, (act, reset) in policies.items():
         result = evaluate(act, env, episodes, reset=reset)
-        print(task, "occluded" * occluded, name, result.metrics(), flush=True)
+        print(form(task, env.config), name, result.metrics(), flush=True)
         rows.append(row(name, result))
     env.close()
     return rows
@@ -68,6 +79,9 @@ def row(name: str, result: Evaluation) -> dict[str, object]:
 
 if __name__ == "__main__":
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 100
-    table = {task: measure(task, False, count) + PUBLISHED.get(task, []) for task in TASKS}
-    table |= {task + OCCLUDED: measure(task, True, count) for task in BOX_TASKS}
+    table = json.loads(OUTPUT.read_text())
+    for task, settings in FORMS:
+        name = form(task, EnvConfig(**settings))
+        if name in (sys.argv[2:] or [name]):
+            table[name] = measure(task, settings, count) + PUBLISHED.get(name, [])
     OUTPUT.write_text(json.dumps(table, indent=1) + "\n")

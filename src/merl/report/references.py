@@ -38,12 +38,8 @@ def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]
 
     Args:
         task: the task's name.
-        env: its form: occluded or not; of the others none were measured.
+        env: its form; which are measured, `docs/measure_references.py` says.
     """
-    form, plain = env or EnvConfig(), EnvConfig()
-    if any(getattr(form, name) != getattr(plain, name) for name in UNMEASURED):
-        return ()
-    rows = _measured().get(task + OCCLUDED * form.occluded, [])
     return tuple(
         Reference(
             row["name"],
@@ -51,16 +47,21 @@ def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]
             None if row["success_end"] is None else Interval(*row["success_end"]),
             row["source"],
         )
-        for row in rows
+        for row in _measured().get(form(task, env or EnvConfig()), [])
     )
 
 
-OCCLUDED = " occluded"
-"""What is added to a task's name for its occluded form."""
-
-
-UNMEASURED = ("start", "goal_reward", "floor")
-"""Fields of `EnvConfig` that make a task another one, for which there are no references."""
+def form(task: str, env: EnvConfig) -> str:
+    """A task's name and what makes it another task, e.g. "move_box around+holding smooth"."""
+    plain = EnvConfig()
+    parts = {
+        "occluded": "occluded",
+        "start": "+".join(env.start),
+        "goal_reward": env.goal_reward,
+        "floor": env.floor,
+    }
+    changed = (told for name, told in parts.items() if getattr(env, name) != getattr(plain, name))
+    return " ".join([task, *changed])
 
 
 @cache

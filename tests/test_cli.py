@@ -422,7 +422,7 @@ def test_ctrl_c_before_training_says_that_nothing_was_written(
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("merl.training.trainer.measure", stop)
+    monkeypatch.setattr("merl.training.parts.measure", stop)
     assert main(["train", "reach_duplo", "--preset", "smoke"]) == 130
     assert "nothing was written" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import io
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 from rich.console import Console
 
@@ -31,11 +31,9 @@ def episodes() -> list[Episode]:
 def watch(terminal: bool) -> str:
     shown = io.StringIO()
     console = Console(file=shown, force_terminal=terminal, width=100)
-    trainer: Any = SimpleNamespace(
-        config=SimpleNamespace(steps=1000, minutes=None), progress=SimpleNamespace(step=0)
-    )
+    run: Any = SimpleNamespace(config=SimpleNamespace(steps=1000, minutes=None))
     with ConsoleView(console) as view:
-        view.begin(cast(Any, None), trainer)
+        view.begin(run, 0)
         for step in range(1, 251):
             view.moment(Moment(step, step), METRICS if step == 250 else {})
         view.evaluating(0, 2)

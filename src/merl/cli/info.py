@@ -14,8 +14,8 @@ from merl.cli.parsing import parse
 from merl.core import MerlError
 from merl.experiments.presets import compose
 from merl.resources import available_memory, free_disk
+from merl.training.parts import Parts
 from merl.training.run import machine, package_versions
-from merl.training.trainer import Trainer
 
 TASK = "reach_duplo"
 FEATURES = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
@@ -67,8 +67,8 @@ def _expected(preset: str) -> str:
     """What training would bring, from timing its update and its step."""
     config = compose(preset, TASK)
     try:
-        with Trainer.prepare(config, new=False) as trainer:
-            timing = trainer.timing
+        with Parts.prepare(config, new=False) as parts:
+            timing = parts.timing
     except MerlError as error:
         return str(error)
     update = timing.update[timing.best]

@@ -13,12 +13,13 @@ from merl.cli.parsing import program
 from merl.cli.summary import summarize
 from merl.core import MerlError, is_image
 from merl.replay import replay_bytes
+from merl.training import trainer
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
 from merl.training.console import ConsoleView
+from merl.training.parts import Parts
 from merl.training.resuming import taken_up
 from merl.training.run import Run
-from merl.training.trainer import Trainer
 
 
 def begin(config: TrainConfig, what: str) -> int:
@@ -75,11 +76,14 @@ def _train(
     with ExitStack() as stack:
         try:
             with console.status("building the scene and timing this machine"):
-                trainer = stack.enter_context(Trainer.prepare(config, new=resumed is None))
+                parts = stack.enter_context(Parts.prepare(config, new=resumed is None))
             done = resumed[1].step if resumed and resumed[1] else 0
-            console.print(_outlook(trainer, what, done), highlight=False)
+            console.print(_outlook(parts, what, done), highlight=False)
             with ConsoleView(console) as view:
-                outcome = trainer.resume(*resumed, view) if resumed else trainer.start(view)
+                if resumed:
+                    outcome = trainer.resume(parts, *resumed, view)
+                else:
+                    outcome = trainer.start(parts, view)
         except KeyboardInterrupt:  # from there on a signal is a wish, see `Interrupt`
             console.print("stopped before training began: nothing was written")
             raise
@@ -100,13 +104,13 @@ def _train(
     return 0
 
 
-def _outlook(trainer: Trainer, what: str, done: int) -> str:
+def _outlook(parts: Parts, what: str, done: int) -> str:
     """What is going to happen, and how long it will take on this machine."""
-    config, timing = trainer.config, trainer.timing
+    config, timing = parts.config, parts.timing
     seconds = timing.seconds(config, done)
-    size = replay_bytes(config.replay, trainer.space, trainer.action_space, config.capacity)
+    size = replay_bytes(config.replay, parts.space, parts.action_space, config.capacity)
     tried = ", ".join(f"{1000 * s:.0f} ms in {how}" for how, s in timing.update.items())
-    seen = not config.own_env and any(is_image(space) for space in trainer.space.values())
+    seen = not config.own_env and any(is_image(space) for space in parts.space.values())
     pictures = f" ({config.env.renderer} pictures)" if seen else ""
     lines = [
         f"{what}: {_amount(config, done)} of {config.task} on {config.device} take about "

@@ -16,7 +16,7 @@ from merl.report.references import Reference, references
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env
 from merl.training.evaluation import Evaluation, evaluate
-from merl.training.trainer import Outcome
+from merl.training.stretch import Outcome
 
 FLOORS = ("random actions", "no motion")
 """The references that need no skill."""

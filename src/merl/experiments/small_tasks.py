@@ -17,11 +17,12 @@ from merl.agents import AGENTS
 from merl.envs.config import EnvConfig
 from merl.envs.own import make_own
 from merl.replay import ReplayConfig
+from merl.training import trainer
 from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.evaluation import EVALUATION_SEED, Evaluation
 from merl.training.loop import Moment
+from merl.training.parts import Parts
 from merl.training.run import Run
-from merl.training.trainer import Trainer
 
 WHOLE, SPLIT, PENDULUM = "merl.envs.dot:whole", "merl.envs.dot:split", "Pendulum-v1"
 CASES = (
@@ -75,8 +76,8 @@ def small_config(task: str, agent: str, *, seed: int, steps: int, run_dir: Path)
 def learn(task: str, agent: str, *, seed: int, steps: int, run_dir: Path) -> Evaluation:
     """Train, and evaluate over 20 episodes without noise."""
     config = small_config(task, agent, seed=seed, steps=steps, run_dir=run_dir)
-    with Trainer.prepare(config, new=True) as trainer:
-        outcome = trainer.start(_Silent())
+    with Parts.prepare(config, new=True) as parts:
+        outcome = trainer.start(parts, _Silent())
     assert outcome.evaluation is not None
     return outcome.evaluation
 
@@ -104,7 +105,7 @@ def optimum(task: str) -> float:
 class _Silent:
     """Watches and says nothing."""
 
-    def begin(self, run: Run, trainer: Trainer) -> None:
+    def begin(self, run: Run, step: int) -> None:
         pass
 
     def moment(self, moment: Moment, metrics: dict[str, float]) -> None:

@@ -16,7 +16,6 @@ from rich.text import Text
 from merl.training.evaluation import Evaluation
 from merl.training.loop import Moment
 from merl.training.run import Run
-from merl.training.trainer import Trainer
 
 RECENT = 10  # training episodes that the shown means are of
 PLAIN_INTERVAL = 30.0  # seconds between lines where there is no terminal
@@ -52,12 +51,12 @@ class ConsoleView:
             self._live.update(self._picture(), refresh=True)
             self._live.stop()
 
-    def begin(self, run: Run, trainer: Trainer) -> None:
+    def begin(self, run: Run, step: int) -> None:
         """Training begins or goes on."""
-        self._total, self._minutes = trainer.config.steps, trainer.config.minutes
+        self._total, self._minutes = run.config.steps, run.config.minutes
         self._task = self._bar.add_task("steps", total=self._total, left="")
         self._start = time.perf_counter()
-        self._recent_step = trainer.progress.step
+        self._recent_step = step
         if self.console.is_terminal:
             self._live.start()
 

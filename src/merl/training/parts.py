@@ -1,0 +1,148 @@
+"""What a run is made of: environments, agent, and where it stands."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import gymnasium
+import torch
+from gymnasium import spaces
+
+from merl.agents import make_agent
+from merl.agents.ddpg import DDPG
+from merl.agents.networks import make_networks
+from merl.core import MerlError
+from merl.replay import check_fits
+from merl.resources import available_memory, keep_freed_memory
+from merl.training.config import TrainConfig
+from merl.training.environment import make_run_env, run_spaces
+from merl.training.loop import Progress, Randomness
+from merl.training.run import refuse_existing, run_path
+from merl.training.timing import measure
+from merl.training.video import MIN_SIDE
+
+
+class Parts:
+    """Environments, agent, and where the run stands.
+
+    Attributes:
+        config: with `device`, `threads` and the agent's `precision` decided.
+        timing: what this machine needs for a step and an update.
+        env: to act in.
+        eval_env: to be evaluated in.
+        films: whether that can be filmed.
+        space: what the agent consumes.
+        action_space: what it does.
+        agent: the learner.
+        progress: where the run stands.
+        randomness: its random streams.
+    """
+
+    def __init__(
+        self, config: TrainConfig, env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, Any]
+    ) -> None:
+        self.env, self.eval_env = env, eval_env
+        self.films = eval_env.render_mode == "rgb_array"
+        self.space, self.action_space = run_spaces(config, env)
+        self.device = choose_device(config.device)
+        check_memory(config, self.space, self.action_space)
+        keep_freed_memory()
+        self.timing = measure(config, env, eval_env, self.space, self.device)
+        best = self.timing.best
+        torch.set_num_threads(best.threads)
+        self.config = dataclasses.replace(
+            config,
+            threads=best.threads,
+            device="cuda" if self.device.type == "cuda" else "cpu",
+            agent=dataclasses.replace(config.agent, precision=best.precision),
+        )
+        self.progress, self.randomness = Progress(), Randomness(config.seed)
+        self.agent: DDPG = make_agent(
+            self.config.agent,
+            self.space,
+            self.action_space,
+            frame_stack=config.replay.frame_stack,
+            seed=self.randomness.agent,
+            device=self.device,
+        )
+
+    @classmethod
+    @contextmanager
+    def prepare(cls, config: TrainConfig, *, new: bool) -> Iterator[Parts]:
+        """Build all that a run needs; what cannot work is refused here, and nothing is written.
+
+        Args:
+            config: of the run.
+            new: the run begins, so its folder must not exist and its replay must fit.
+
+        Raises:
+            MerlError: a device, renderer, sense, folder or size that is not to be had.
+        """
+        choose_device(config.device)
+        processors = os.cpu_count() or 1
+        if config.threads is not None and config.threads > processors:
+            raise MerlError(
+                f"threads is {config.threads}, but this machine has {processors} processors: "
+                f"give at most {processors}"
+            )
+        if new:
+            refuse_existing(run_path(config))
+        with ExitStack() as stack:
+            env = make_run_env(config)
+            stack.callback(env.close)
+            space, actions = run_spaces(config, env)
+            if new:
+                check_fits(
+                    config.replay,
+                    space,
+                    actions,
+                    directory=run_path(config),
+                    capacity=config.capacity,
+                )
+            size = max(config.env.render_size, MIN_SIDE)
+            eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)
+            stack.callback(eval_env.close)
+            yield cls(config, env, eval_env)
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of that name; "auto" is CUDA where it is there.
+
+    Raises:
+        MerlError: CUDA is asked for and not there.
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise MerlError("--device cuda: no CUDA device is found here; use --device cpu or auto")
+    return torch.device(name)
+
+
+def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.Box) -> None:
+    """Refuse networks or batches that this process could never hold.
+
+    Counted are the weights with gradient, moments and average, and the batch's inputs with what one
+    layer makes of them: less than what an update takes, so that nothing is refused that would fit.
+
+    Raises:
+        MerlError: naming what is too large.
+    """
+    with torch.device("meta"):
+        networks = make_networks(
+            config.agent, space, action_space.shape[0], config.replay.frame_stack
+        )
+    weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
+    stack, size = config.replay.frame_stack, config.replay.batch_size
+    inputs = 2 * 5 * size * sum(math.prod(s.shape or ()) * stack for s in space.values())
+    room = available_memory()
+    for what, need in (("networks of agent.*", weights), (f"replay.batch-size {size}", inputs)):
+        if need > room:
+            raise MerlError(
+                f"{what} would take {need / 1e9:.3g} GB or more, but {room / 1e9:.3g} GB of memory "
+                "are available: make it smaller"
+            )

@@ -19,7 +19,6 @@ from __future__ import annotations
 import logging
 import mmap
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,7 @@ from merl.core import Batch, MerlError, Observation, Transition
 from merl.replay.compression import CompressedPictures
 from merl.replay.config import ReplayConfig, check_fits, slots_for
 from merl.replay.journal import Journal
+from merl.replay.sampling import Sampler
 from merl.replay.storage import (
     check_value,
     field_name,
@@ -41,17 +41,6 @@ from merl.replay.storage import (
 )
 
 _LOG = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class _Picks:
-    """Where B sampled steps lie in the ring, and what they paid."""
-
-    now: NDArray[np.int64]  # (B, K) slots of o_t's frames, oldest first
-    then: NDArray[np.int64]  # (B, K) slots of o_{t+m}'s
-    action: NDArray[np.int64]  # (B,) slot of the moment that a_t led to
-    reward: NDArray[np.float32]  # (B,)
-    discount: NDArray[np.float32]  # (B,)
 
 
 class Replay:
@@ -123,6 +112,8 @@ class Replay:
         if directory is not None:
             self._journal = Journal(directory, self._data, self._pictures)
         self._slots = len(self._data["moment"])
+        fields_there = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        self._sampler = Sampler(fields_there, self._slots, config)
         self._moments = self._steps = 0  # ever written
         self._first = 0  # the oldest step that can be sampled
         self._oldest = 1  # the oldest moment that is held
@@ -189,12 +180,16 @@ class Replay:
         if not len(self):
             raise ValueError("the replay is empty: add a step before sampling")
         steps = rng.integers(self._first, self._steps, size=batch_size)
-        picks = self._pick(self._sources[steps % self.capacity])
+        picks = self._sampler.pick(
+            torch.from_numpy(self._sources[steps % self.capacity]),
+            newest=torch.tensor([self._moments]),
+            base=torch.tensor([0]),
+        )
         return Batch(
             observation=self._observation(picks.now),
-            action=torch.from_numpy(self._data["action"][picks.action]),
-            reward=torch.from_numpy(picks.reward),
-            discount=torch.from_numpy(picks.discount),
+            action=self._sampler.action(picks),
+            reward=picks.reward,
+            discount=picks.discount,
             next_observation=self._observation(picks.then),
         )
 
@@ -330,38 +325,11 @@ class Replay:
         self._sources[np.arange(self._steps - len(sources), self._steps) % self.capacity] = sources
         self._forget()
 
-    def _pick(self, source: NDArray[np.int64]) -> _Picks:
-        """Lay out the samples that start at moments `source`, (B,)."""
-        data, gamma = self._data, self.config.discount
-        begun = source - data["position"][(source - 1) % self._slots]  # (B,) the episode's first
-        powers = np.arange(self.config.n_step)
-        ahead = source[:, None] + 1 + powers  # (B, n) the moments that r_t, r_{t+1}, ... led to
-        slots = (ahead - 1) % self._slots
-        same = (ahead <= self._moments) & (data["position"][slots] > 0)
-        same = np.logical_and.accumulate(same, axis=1)
-        m = same.sum(axis=1)
-        end = source + m
-        rewards = np.where(same, data["reward"][slots], 0.0) * gamma**powers  # float64
-        discount = gamma**m * data["discount"][(end - 1) % self._slots]
-        back = np.arange(self.config.frame_stack)[::-1]
-        now = np.maximum(source[:, None] - back, begun[:, None])
-        then = np.maximum(end[:, None] - back, begun[:, None])
-        return _Picks(
-            now=(now - 1) % self._slots,
-            then=(then - 1) % self._slots,
-            action=slots[:, 0],
-            reward=rewards.sum(axis=1).astype(np.float32),
-            discount=discount.astype(np.float32),
-        )
-
-    def _observation(self, slots: NDArray[np.int64]) -> dict[str, torch.Tensor]:
+    def _observation(self, slots: torch.Tensor) -> dict[str, torch.Tensor]:
         """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""
-        observation = {}
-        for key, name in self._keys.items():
-            if name in self._pictures:
-                observation[key] = torch.from_numpy(self._pictures[name].take(slots))
-                continue
-            array = self._data[name]
-            index = slots if array.dtype == np.uint8 else slots[:, -1]
-            observation[key] = torch.from_numpy(array.take(index, axis=0))
-        return observation
+        return {
+            key: torch.from_numpy(self._pictures[name].take(slots.numpy()))
+            if name in self._pictures
+            else self._sampler.observed(name, slots)
+            for key, name in self._keys.items()
+        }

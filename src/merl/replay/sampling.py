@@ -1,0 +1,92 @@
+"""What a sampled step is made of: its stack, its n-step return, and what it led to.
+
+The same arithmetic on the arrays of the ring, wherever they lie: in memory, on the disk, or on a
+GPU, where nothing of it asks the card for an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from merl.replay.config import ReplayConfig
+
+
+@dataclass(frozen=True)
+class Picks:
+    """Where B sampled steps lie in the ring, and what they paid.
+
+    Attributes:
+        now: slots of o_t's frames, oldest first, int64 (B, K).
+        then: slots of o_{t+m}'s, likewise.
+        action: slot of the moment that a_t led to, int64 (B,).
+        reward: sum of gamma^i r_{t+i} for i < m, float32 (B,).
+        discount: gamma^m, or 0 at a true end, float32 (B,).
+    """
+
+    now: Tensor
+    then: Tensor
+    action: Tensor
+    reward: Tensor
+    discount: Tensor
+
+
+class Sampler:
+    """Finds what belongs to a step, in one ring or in several that lie behind one another.
+
+    Args:
+        fields: the arrays by name, each (rings x slots, ...); see `storage.fields_of`.
+        slots: of one ring.
+        config: stack, n and discount.
+    """
+
+    def __init__(self, fields: Mapping[str, Tensor], slots: int, config: ReplayConfig) -> None:
+        self._fields, self._slots = fields, slots
+        device = fields["position"].device
+        self._ahead = torch.arange(config.n_step, device=device)
+        self._back = torch.arange(config.frame_stack - 1, -1, -1, device=device)
+        powers = [config.discount**power for power in range(config.n_step + 1)]
+        self._powers = torch.tensor(powers, dtype=torch.float64, device=device)
+
+    def pick(self, source: Tensor, newest: Tensor, base: Tensor) -> Picks:
+        """Lay out the samples that start at moments `source`.
+
+        Args:
+            source: numbers of moments, int64 (B,).
+            newest: the newest moment of their ring, int64 (B,) or (1,).
+            base: the first slot of their ring, likewise.
+        """
+        fields, base, newest = self._fields, base[:, None], newest[:, None]
+        moments = source[:, None]
+        begun = moments - fields["position"][self._slot(moments, base)]  # the episode's first
+        ahead = moments + 1 + self._ahead  # (B, n): what r_t, r_{t+1}, ... led to
+        slots = self._slot(ahead, base)
+        same = ((ahead <= newest) & (fields["position"][slots] > 0)).long().cumprod(dim=1)
+        steps = same.sum(dim=1)  # (B,): m
+        end = moments + steps[:, None]
+        rewards = fields["reward"][slots] * same * self._powers[:-1]  # float64
+        last = fields["discount"][self._slot(end, base)[:, 0]]
+        return Picks(
+            now=self._slot(torch.maximum(moments - self._back, begun), base),
+            then=self._slot(torch.maximum(end - self._back, begun), base),
+            action=slots[:, 0],
+            reward=rewards.sum(dim=1).float(),
+            discount=(self._powers[steps] * last).float(),
+        )
+
+    def observed(self, name: str, slots: Tensor) -> Tensor:
+        """What was seen at slots (B, K): (B, K, H, W, C); of vectors the newest, (B, n)."""
+        field = self._fields[name]
+        if field.dtype != torch.uint8:
+            return field.index_select(0, slots[:, -1])
+        return field.index_select(0, slots.flatten()).view(*slots.shape, *field.shape[1:])
+
+    def action(self, picks: Picks) -> Tensor:
+        """a_t, float32 (B, A)."""
+        return self._fields["action"].index_select(0, picks.action)
+
+    def _slot(self, moment: Tensor, base: Tensor) -> Tensor:
+        return (moment - 1) % self._slots + base

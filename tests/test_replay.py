@@ -539,7 +539,7 @@ def test_a_step_takes_at_most_21_6_kilobytes(tmp_path):
     assert len(replay) == 1000
     on_disk = sum(file.stat().st_size for file in files(tmp_path))
     assert on_disk == replay_bytes(settings, observations, actions)
-    in_memory = replay._sources.nbytes
+    in_memory = replay.sources.nbytes
     million = replay_bytes(settings, observations, actions, 1_000_000) + 1000 * in_memory
     assert million <= 21_600 * 1_000_000
 

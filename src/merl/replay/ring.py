@@ -50,6 +50,13 @@ class Replay:
     included. Nothing reaches across an episode's boundary: at the start the stack repeats the first
     frame, at the end the return is shorter. An episode that was begun while the former had not
     ended cuts that one off; it bootstraps, as at a time limit.
+
+    Attributes:
+        config: what is kept and how it is sampled.
+        capacity: steps that are kept.
+        slots: of the ring.
+        keys: the field that each of an observation's keys is kept in.
+        sources: step i led away from moment sources[i mod capacity].
     """
 
     def __init__(
@@ -95,7 +102,7 @@ class Replay:
                 name: np.frombuffer(self._files[name], field.dtype).reshape(-1, *field.shape)
                 for name, field in fields.items()
             }
-        self._keys = {key: field_name(key) for key in observation_space.spaces}
+        self.keys = {key: field_name(key) for key in observation_space.spaces}
         self._pictures = {
             name: CompressedPictures(
                 arrays.pop(name).reshape(-1),
@@ -103,7 +110,7 @@ class Replay:
                 observation_space[key].shape or (),
                 None if directory is None else directory / f"{name}.background",
             )
-            for key, name in self._keys.items()
+            for key, name in self.keys.items()
             if span_name(key) in fields
         }
         self._data = arrays  # a row for each slot
@@ -111,17 +118,16 @@ class Replay:
         self._journal: Journal | None = None
         if directory is not None:
             self._journal = Journal(directory, self._data, self._pictures)
-        self._slots = len(self._data["moment"])
+        self.slots = len(self._data["moment"])
         fields_there = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        self._sampler = Sampler(fields_there, self._slots, config)
+        self._sampler = Sampler(fields_there, self.slots, config)
         self._moments = self._steps = 0  # ever written
         self._first = 0  # the oldest step that can be sampled
         self._oldest = 1  # the oldest moment that is held
         self._open = False  # an episode is in progress
         self._settled = 0  # the newest moment of the last checkpoint
         self._told = False  # that fewer steps are held than asked for
-        # Step i led away from moment _sources[i mod capacity].
-        self._sources = np.zeros(self.capacity, np.int64)
+        self.sources = np.zeros(self.capacity, np.int64)
         self._take_over(moments=int(self._data["moment"].max()))
 
     def __len__(self) -> int:
@@ -136,7 +142,7 @@ class Replay:
         """
         self._write(observation, position=0, action=None, reward=0.0, discount=1.0)
         for name, pictures in self._pictures.items():
-            pictures.begun(next(observation[key] for key, n in self._keys.items() if n == name))
+            pictures.begun(next(observation[key] for key, n in self.keys.items() if n == name))
         self._open = True
 
     def add(self, transition: Transition) -> None:
@@ -161,7 +167,7 @@ class Replay:
             reward=float(transition.reward),
             discount=float(transition.discount),
         )
-        self._sources[self._steps % self.capacity] = source
+        self.sources[self._steps % self.capacity] = source
         self._steps += 1
         self._forget()
         self._open = not transition.last
@@ -181,7 +187,7 @@ class Replay:
             raise ValueError("the replay is empty: add a step before sampling")
         steps = rng.integers(self._first, self._steps, size=batch_size)
         picks = self._sampler.pick(
-            torch.from_numpy(self._sources[steps % self.capacity]),
+            torch.from_numpy(self.sources[steps % self.capacity]),
             newest=torch.tensor([self._moments]),
             base=torch.tensor([0]),
         )
@@ -192,6 +198,19 @@ class Replay:
             discount=picks.discount,
             next_observation=self._observation(picks.then),
         )
+
+    @property
+    def compressed(self) -> bool:
+        """Whether pictures are kept compressed."""
+        return bool(self._pictures)
+
+    def arrays(self) -> Mapping[str, NDArray[Any]]:
+        """The ring's arrays by field, (slots, ...), to be read; compressed pictures are not there."""
+        return self._data
+
+    def counts(self) -> tuple[int, int, int]:
+        """The first step that can be sampled, and how many steps and moments there were."""
+        return self._first, self._steps, self._moments
 
     def flush(self) -> None:
         """Have everything written reach the disk; returns when it has."""
@@ -232,7 +251,7 @@ class Replay:
 
     def _slot(self, moment: int) -> int:
         """Where the ring holds a moment."""
-        return (moment - 1) % self._slots
+        return (moment - 1) % self.slots
 
     def _write(
         self,
@@ -245,7 +264,7 @@ class Replay:
     ) -> None:
         """Write the next moment; all is checked before anything is changed."""
         data = self._data
-        values = {name: observation.get(key) for key, name in self._keys.items()}
+        values = {name: observation.get(key) for key, name in self.keys.items()}
         values["action"] = np.zeros_like(data["action"][0]) if action is None else action
         for name, value in values.items():
             field = self._values[name]
@@ -270,7 +289,7 @@ class Replay:
         ends = {name: self._pictures[name].end_of(picture) for name, picture in kept.items()}
         while self._oldest < moment:
             slot = self._slot(self._oldest)
-            if self._oldest > moment - self._slots:
+            if self._oldest > moment - self.slots:
                 if not any(self._pictures[n].overwritten(slot, end) for n, end in ends.items()):
                     break
                 self._tell_of_less()
@@ -294,7 +313,7 @@ class Replay:
     def _forget(self) -> None:
         """Let go of the oldest steps: beyond the capacity, or with a frame that is overwritten."""
         while self._first < self._steps:
-            source = int(self._sources[self._first % self.capacity])
+            source = int(self.sources[self._first % self.capacity])
             position = int(self._data["position"][self._slot(source)])
             oldest = source - min(position, self.config.frame_stack - 1)
             if self._steps - self._first <= self.capacity and oldest >= self._oldest:
@@ -311,8 +330,8 @@ class Replay:
         """
         stamps = self._data["moment"]
         stamps[stamps > moments] = 0  # else they would pass for what follows, if opened once more
-        numbers = np.arange(max(0, moments - self._slots) + 1, moments + 1)
-        slots = (numbers - 1) % self._slots
+        numbers = np.arange(max(0, moments - self.slots) + 1, moments + 1)
+        slots = (numbers - 1) % self.slots
         missing = numbers[stamps[slots] != numbers]  # overwritten since, or only half written
         self._oldest = int(missing[-1] if missing.size else moments - len(numbers)) + 1
         for pictures in self._pictures.values():
@@ -322,7 +341,7 @@ class Replay:
         self._moments, self._open = moments, in_progress
         self._steps = len(sources) if steps is None else steps
         self._first = self._steps - len(sources)
-        self._sources[np.arange(self._steps - len(sources), self._steps) % self.capacity] = sources
+        self.sources[np.arange(self._steps - len(sources), self._steps) % self.capacity] = sources
         self._forget()
 
     def _observation(self, slots: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -331,5 +350,5 @@ class Replay:
             key: torch.from_numpy(self._pictures[name].take(slots.numpy()))
             if name in self._pictures
             else self._sampler.observed(name, slots)
-            for key, name in self._keys.items()
+            for key, name in self.keys.items()
         }

@@ -1,8 +1,8 @@
 """A copy of the rings on the device that learns, from which batches are drawn there.
 
 The rings on the host stay what a run goes on from. What they take in is brought over when it is
-asked for, a slot or two a step; sampling reads the copy alone, and asks nothing of the host, so that
-it can be part of a CUDA graph.
+asked for, a slot or two a step; sampling reads the copy alone, and asks nothing of the host, so
+that it can be part of a CUDA graph.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def _parts(had: int, has: int, length: int) -> Iterator[slice]:
     """Where in a ring the entries number `had` to `has` - 1 lie, in pieces; the last `length`."""
     begin = max(had, has - length)
     marks = {begin, has, *range(begin, has, CHUNK)}
-    marks |= {whole for whole in range(-(-begin // length) * length, has, length)}
+    marks |= set(range(-(-begin // length) * length, has, length))
     for start, stop in pairwise(sorted(marks)):
         at = start % length
         yield slice(at, at + stop - start)

@@ -205,7 +205,7 @@ class Replay:
         return bool(self._pictures)
 
     def arrays(self) -> Mapping[str, NDArray[Any]]:
-        """The ring's arrays by field, (slots, ...), to be read; compressed pictures are not there."""
+        """The ring's arrays by field, (slots, ...), to be read; of compressed pictures none."""
         return self._data
 
     def counts(self) -> tuple[int, int, int]:

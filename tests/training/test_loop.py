@@ -10,10 +10,12 @@ from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.replay import Lanes, ReplayConfig
+from merl.replay.on_device import OnDevice
 from merl.training.acting import Here
 from merl.training.config import TrainConfig
-from merl.training.loop import Moment, Progress, Randomness, Stage, train
+from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train
 from merl.training.rollout import Episode, FrameStack
+from merl.training.updating import UpdateOnDevice, update_from_host
 from toy import DotEnv
 
 CPU = torch.device("cpu")
@@ -40,10 +42,20 @@ class Parts:
         )
         self.replay = Lanes(config.replay, space, actions, capacity=config.steps)
         self.progress = Progress()
+        self.update: Update = update_from_host(self.agent, self.replay, self.randomness, config)
         self.stage = Stage(Here(self.env), self.replay, [FrameStack(3, ("image",), CPU)])
 
     def run(self) -> list[Moment]:
-        return list(train(self.stage, self.agent, self.progress, self.randomness, self.config))
+        return list(
+            train(
+                self.stage,
+                self.agent,
+                self.update,
+                self.progress,
+                self.randomness,
+                self.config,
+            )
+        )
 
     def weights(self) -> torch.Tensor:
         return torch.cat([p.detach().flatten() for p in self.agent.networks.parameters()])
@@ -155,3 +167,35 @@ def test_a_frame_that_is_refilled_does_not_change_the_stack() -> None:
         buffer[:] = value
         stack.push({"camera": buffer})
     assert stack.observation()["camera"][0, :, 0, 0, 0].tolist() == [0, 1, 2]
+
+
+NOISES = [
+    CONFIG.agent,
+    dataclasses.replace(CONFIG.agent, noise_std=1.0, noise_std_end=0.1, noise_steps=60),
+]
+
+
+@pytest.mark.parametrize("agent", NOISES, ids=["fixed", "scheduled"])
+def test_on_the_device_the_same_is_learnt_from_the_same_batch(agent: MERLConfig) -> None:
+    """What a GPU does, on the CPU: the twin learns from each batch on the host's way."""
+    parts = Parts(dataclasses.replace(CONFIG, agent=agent))
+    twin = Parts(parts.config).agent
+    copy = OnDevice(parts.replay.lanes, CPU)
+    on_device = UpdateOnDevice(parts.agent, copy, 8, seed=5)
+    same = torch.Generator().manual_seed(5)
+
+    def both() -> dict[str, torch.Tensor]:
+        found = on_device()
+        twin.step = parts.agent.step
+        expected = twin.update(copy.sample(8, same))
+        for name, value in found.items():
+            assert torch.equal(value, expected[name]), name
+        return found
+
+    parts.update = both
+    told = [moment for moment in parts.run() if moment.learning]
+    assert len(told) == 40
+    for one, other in zip(
+        parts.agent.networks.parameters(), twin.networks.parameters(), strict=True
+    ):
+        assert torch.equal(one, other)

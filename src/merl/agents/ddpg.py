@@ -67,12 +67,15 @@ class DDPG:
 
     Attributes:
         step: environment steps so far, which the noise may depend on; set by who drives it.
+        sigma: the standard deviation of the noise in updates, where it is kept on the device, as a
+            CUDA graph must read it; None: as the config has it for `step`.
     """
 
     def __init__(
         self, networks: Networks, config: AgentConfig, *, seed: int, device: torch.device
     ) -> None:
         self.step = 0
+        self.sigma: Tensor | None = None
         self.config = config
         self.device = device
         self.networks = networks.to(device)
@@ -215,7 +218,8 @@ class DDPG:
     def epsilon(self, noise: Tensor) -> Tensor:
         """Standard normal numbers to the noise of an update: clip(N(0, sigma^2), -c, c)."""
         clip = self.config.noise_clip
-        return noise.mul_(self.config.noise(self.step)).clamp_(-clip, clip)
+        sigma = self.config.noise(self.step) if self.sigma is None else self.sigma
+        return noise.mul_(sigma).clamp_(-clip, clip)
 
     # Saving ---------------------------------------------------------------------------------
 
@@ -277,7 +281,9 @@ class DDPG:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled)
 
     def _adam(self, parameters: Sequence[Tensor]) -> torch.optim.Adam:
-        return torch.optim.Adam(parameters, lr=self.config.learning_rate, fused=True)
+        on_gpu = self.device.type == "cuda"  # whose graphs read the step from the device
+        rate = self.config.learning_rate
+        return torch.optim.Adam(parameters, lr=rate, fused=True, capturable=on_gpu)
 
 
 def step_optimizer(

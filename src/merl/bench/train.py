@@ -26,6 +26,7 @@ from merl.training.environment import make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness, Stage, train
 from merl.training.rollout import FrameStack
 from merl.training.timing import measure
+from merl.training.updating import update_from_host
 
 STRICT = "strict: one environment, in turn with the learner"
 WARM_UP = 100
@@ -124,7 +125,9 @@ class _Loop:
         agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)
         self._progress = Progress()
         stage = Stage(environments, replay, stacks)
-        self._moments = train(stage, agent, self._progress, Randomness(config.seed), config)
+        randomness = Randomness(config.seed)
+        update = update_from_host(agent, replay, randomness, config)
+        self._moments = train(stage, agent, update, self._progress, randomness, config)
 
     def rate(self, steps: int) -> float:
         """Go on by so many steps, or a few more; returns steps per second."""

@@ -6,7 +6,7 @@ checkpoints stay outside, and the same loop serves every agent and every environ
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -53,19 +53,25 @@ class Moment:
     lost: str | None = None
 
 
+Update = Callable[[], dict[str, Tensor]]
+"""Makes one update; returns its metrics, scalars on the device."""
+
+
 class Randomness:
     """One seed, split by purpose: no use of one stream moves another.
 
     Attributes:
         agent: the seed of initialisation, noise and shifts.
+        device: that of what is sampled from a replay on a GPU.
         actions: the uniformly random actions of the start.
         batches: what is sampled from replay.
     """
 
     def __init__(self, seed: int) -> None:
-        words = np.random.SeedSequence(seed).generate_state(4)
+        words = np.random.SeedSequence(seed).generate_state(5)
         self._seed, self._environment, self.agent = seed, int(words[0]), int(words[1])
-        self.actions, self.batches = (np.random.default_rng(int(word)) for word in words[2:])
+        self.actions, self.batches = (np.random.default_rng(int(word)) for word in words[2:4])
+        self.device = int(words[4])
 
     def environment(self, index: int = 0, restart: int = 0) -> int:
         """The seed of an environment's first reset; it goes on from there by itself.
@@ -92,14 +98,20 @@ class Randomness:
 
 
 def train(
-    stage: Stage, agent: Agent, progress: Progress, randomness: Randomness, config: TrainConfig
+    stage: Stage,
+    agent: Agent,
+    update: Update,
+    progress: Progress,
+    randomness: Randomness,
+    config: TrainConfig,
 ) -> Iterator[Moment]:
     """Act and learn until `config.steps`; yields after each step of the environments.
 
     Args:
         stage: where the agent acts, and what remembers it; its environments are seeded by this loop
             if the run begins, and stand where the caller set them if it goes on.
-        agent: acts and learns.
+        agent: acts.
+        update: has it learn from what is remembered.
         progress: moved on as the run goes.
         randomness: the run's random streams.
         config: steps, seed steps, random steps, updates per step, batch size.
@@ -116,14 +128,14 @@ def train(
             stage.begin_episodes(randomness, progress)
             stage.act(_actions(stage, agent, progress, randomness, config))
             if not config.synchronous:  # while the environments step
-                learning = _learn(agent, stage.replay, progress, randomness, config)
+                learning = _learn(update, progress, config)
             ended = stage.remember(progress, config.action_repeat)
         except Lost as lost:
             stage.broken = True
             yield Moment(progress.step, progress.updates, learning, lost=str(lost))
             continue
         if config.synchronous or progress.step >= config.steps:
-            learning = _learn(agent, stage.replay, progress, randomness, config) or learning
+            learning = _learn(update, progress, config) or learning
         progress.episodes += len(ended)
         yield Moment(progress.step, progress.updates, learning, ended)
 
@@ -215,17 +227,11 @@ def _actions(
     return chosen
 
 
-def _learn(
-    agent: Agent,
-    replay: Lanes,
-    progress: Progress,
-    randomness: Randomness,
-    config: TrainConfig,
-) -> dict[str, Tensor]:
+def _learn(update: Update, progress: Progress, config: TrainConfig) -> dict[str, Tensor]:
     """The updates that are due: after t steps, (t - seed_steps) updates_per_step in all."""
     due = int((progress.step - config.seed_steps) * config.updates_per_step)
     metrics: dict[str, Tensor] = {}
     while progress.updates < due:
-        metrics = agent.update(replay.sample(config.replay.batch_size, randomness.batches))
+        metrics = update()
         progress.updates += 1
     return metrics

@@ -22,6 +22,7 @@ from merl.training.parts import Parts
 from merl.training.rollout import FrameStack, mean_metrics
 from merl.training.run import Run, to_plain
 from merl.training.signals import Interrupt
+from merl.training.updating import make_update
 
 
 class View(Protocol):
@@ -100,6 +101,9 @@ class Stretch:
             for _ in range(self.environments.count)
         ]
         stage = Stage(self.environments, self.replay, stacks)
+        update = make_update(
+            parts.agent, self.replay, parts.randomness, self.config, self.view.warn
+        )
         self.view.begin(self.run, progress.step)
         if not parts.films and self.config.eval.video != "none":
             self.view.warn("there will be no videos: the environment does not render to an array")
@@ -107,7 +111,7 @@ class Stretch:
             self._save()  # from here on there is something to go on from
         self.clock.mark(progress)
         for count, moment in enumerate(
-            train(stage, parts.agent, progress, parts.randomness, self.config)
+            train(stage, parts.agent, update, progress, parts.randomness, self.config)
         ):
             if count == 0 and not moment.lost and None in self._environment_states():
                 self.view.warn(

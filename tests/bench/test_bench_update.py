@@ -132,7 +132,7 @@ def test_the_reference_makes_the_same_update(agent: str, layers: int) -> None:
 
 
 def test_it_runs_and_shows_every_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(_: int) -> None:
+    def missing(*_: object) -> None:
         raise MerlError("not installed")
 
     monkeypatch.setattr(bench, "_stable_baselines", missing)

@@ -172,6 +172,12 @@ class Plain:
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=learning_rate)
         self.actor_adam = torch.optim.Adam(actor, lr=learning_rate)
 
+    def to(self, device: torch.device) -> Plain:
+        """The same agent, moved there."""
+        for module in (self.encoder, self.critic, self.critic_target, self.actor_fuse, self.actor):
+            module.to(device)
+        return self
+
     def update(self, sample: Sample) -> tuple[Tensor, Tensor]:
         """One update with its own random numbers; the two losses."""
         noise, next_noise = (

@@ -7,7 +7,8 @@ MERL with the heads of six layers that the paper has for `move_box` and `lift_bo
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -17,9 +18,13 @@ from rich.table import Table
 from torch import Tensor
 
 from merl.agents import AGENTS, make_agent
+from merl.agents.ddpg import DDPG
 from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
 from merl.bench.plain import Encoder, Plain, Sample
-from merl.core import Batch, MerlError
+from merl.core import Batch, MerlError, Transition
+from merl.replay import Replay, ReplayConfig
+from merl.replay.on_device import OnDevice
+from merl.training.updating import UpdateOnDevice
 
 SIDE, STACK, PROPRIO, ACTIONS, LAYERS = 84, 3, 24, 9, 6
 REFERENCE, OURS, DRQV2, OUR_DRQV2, SB3 = (
@@ -35,50 +40,68 @@ SB3_DIFFERS = (
 )
 BARS = {f"{OURS}, bf16": 6.0, f"{OURS}, fp32": 1.5}
 """How many times as fast as the reference it is to be, on two cores with AMX-bf16."""
+WHOLE = ", drawn on the card"
+UPDATES_ON_GPU = 50
+"""In a turn."""
 
 
 def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
-    """Time an update on every side, on all threads of this process.
+    """Time an update on every side, on a GPU where there is one, else on all threads.
 
     Args:
         repeats: how many rounds, in each of which every side makes one update.
         batch_size: B.
+
+    On a GPU each turn is `UPDATES_ON_GPU` updates, and beside the update from a batch that lies on
+    the card there is the whole of it, drawn from a replay that lies there, as training makes it.
 
     Returns:
         Plain values: `updates_per_s` by side and `ratio` (to the reference of the same agent,
         within each round), each as `median`, `low` and `high` over the rounds; `skipped`, why a
         side is missing; the circumstances.
     """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    on_gpu = device.type == "cuda"
+    times = UPDATES_ON_GPU if on_gpu else 1
+
+    def repeated(update: Work) -> Work:
+        def work() -> None:
+            for _ in range(times):
+                update()
+            if on_gpu:
+                torch.cuda.synchronize()
+
+        return work
+
     result: dict[str, Any] = {"repeats": repeats, "batch_size": batch_size} | circumstances()
-    batch = _batch(batch_size)
+    batch = _batch(batch_size).to(device)
+    replay = OnDevice([_noise()], device) if on_gpu else None
     sides: dict[str, Work] = {}
     of: dict[str, str] = {}
     for reference, ours, agent in ((REFERENCE, OURS, "merl"), (DRQV2, OUR_DRQV2, "drqv2")):
         plain, sample = reference_of(agent), as_sample(batch, vector=agent == "merl")
-        sides[reference] = lambda plain=plain, sample=sample: plain.update(sample)  # type: ignore[misc]
+        plain = plain.to(device)
+        sides[reference] = repeated(partial(plain.update, sample))
         for precision in ("fp32", "bf16"):
-            config = dataclasses.replace(AGENTS[agent], precision=precision)
-            if agent == "merl":
-                config = dataclasses.replace(config, head_layers=LAYERS)
-            learner = make_agent(
-                config,
-                _space(),
-                spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32),
-                frame_stack=STACK,
-                seed=0,
-                device=torch.device("cpu"),
-            )
-            name = f"{ours}, {precision}"
-            sides[name] = lambda learner=learner: learner.update(batch)  # type: ignore[misc]
+            name, learner = f"{ours}, {precision}", _learner(agent, precision, device)
+            sides[name] = repeated(partial(learner.update, batch))
             of[name] = reference
+            if replay is not None:
+                name += WHOLE
+                update = UpdateOnDevice(
+                    _learner(agent, precision, device), replay, batch_size, seed=0
+                )
+                for _ in range(UpdateOnDevice.WARM_UP):
+                    update()
+                sides[name], of[name] = repeated(update), reference
     try:
-        sides[SB3] = _stable_baselines(batch_size)
+        sides[SB3] = repeated(_stable_baselines(batch_size, device))
         of[SB3], result["stable_baselines"] = REFERENCE, SB3_DIFFERS
     except MerlError as reason:
         result["skipped"] = f"{SB3}: {reason}"
     taken = take_turns(sides, repeats)
     result["updates_per_s"] = {
-        side: spread([1 / t for t in times]) for side, times in taken.items()
+        side: spread([times / t for t in each]) for side, each in taken.items()
     }
     result["ratio"] = {
         side: spread([theirs / t for theirs, t in zip(taken[reference], taken[side], strict=True)])
@@ -141,6 +164,31 @@ def as_sample(batch: Batch, *, vector: bool) -> Sample:
     )
 
 
+def _learner(agent: str, precision: Literal["fp32", "bf16"], device: torch.device) -> DDPG:
+    config = dataclasses.replace(AGENTS[agent], precision=precision)
+    if agent == "merl":
+        config = dataclasses.replace(config, head_layers=LAYERS)
+    actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
+    return make_agent(config, _space(), actions, frame_stack=STACK, seed=0, device=device)
+
+
+def _noise(steps: int = 2000) -> Replay:
+    """A replay of noise, in episodes of 250 steps."""
+    actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
+    replay = Replay(ReplayConfig(), _space(), actions, capacity=steps)
+    rng = np.random.default_rng(0)
+    for step in range(steps):
+        seen = {
+            "image": rng.integers(0, 256, (SIDE, SIDE, 3), np.uint8),
+            "proprio": rng.standard_normal(PROPRIO, np.float32),
+        }
+        if step % 250 == 0:
+            replay.begin(seen)
+        action = rng.uniform(-1, 1, ACTIONS).astype(np.float32)
+        replay.add(Transition(action, rng.uniform(), 1.0, seen, last=step % 250 == 249))
+    return replay
+
+
 def _space() -> spaces.Dict:
     return spaces.Dict(
         {
@@ -166,7 +214,7 @@ def _batch(size: int) -> Batch:
     return Batch(observation(), action, reward, torch.full((size,), 0.97), observation())
 
 
-def _stable_baselines(batch_size: int) -> Work:
+def _stable_baselines(batch_size: int, device: torch.device) -> Work:
     """An update of its TD3 with the same encoder.
 
     Raises:
@@ -206,7 +254,7 @@ def _stable_baselines(batch_size: int) -> Work:
             "share_features_extractor": True,
             "normalize_images": False,
         },
-        device="cpu",
+        device=device,
     )
     model.set_logger(Logger(folder=None, output_formats=[]))
     noise = np.random.default_rng(0)

@@ -24,13 +24,13 @@ def main() -> None:
     states = {
         "reach_duplo": "reach_duplo",
         "move_box": "move_box",
-        "move_box, margin of the goal 0.2 m": "move_box-margin20",
         "move_box, goal linear to 0.3 m": "move_box-linear30",
         "move_box, the same, the hand around the box": "move_box-around",
-        "move_box, the same, around or holding, smooth floor": "move_box-smooth",
+        "move_box, easier: around or holding, both, smooth": "move_box-easier",
         "lift_box": "lift_box",
         "lift_box, goal linear to 0.3 m": "lift_box-linear30",
         "lift_box, the same, the hand around or holding the box": "lift_box-holding",
+        "lift_box, easier: around or holding, both, smooth": "lift_box-easier",
     }
     files = {title: DOCS / "data" / f"state-{name}-seed0.csv" for title, name in states.items()}
     reward_terms(files, DOCS / "images" / "state.png")

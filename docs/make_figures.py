@@ -4,9 +4,11 @@ import json
 from pathlib import Path
 from statistics import mean
 
+from merl.envs import EnvConfig
 from merl.report.figures import learning_curves, reward_terms
 from merl.report.references import references
 
+EASIER = EnvConfig(start=("around", "holding"), goal_reward="both", floor="smooth")
 DOCS = Path(__file__).parent
 
 
@@ -33,7 +35,21 @@ def main() -> None:
         "lift_box, easier: around or holding, both, smooth": "lift_box-easier",
     }
     files = {title: DOCS / "data" / f"state-{name}-seed0.csv" for title, name in states.items()}
-    reward_terms(files, DOCS / "images" / "state.png")
+    forms = {
+        "reach_duplo": ("reach_duplo", EnvConfig()),
+        "move_box": ("move_box", EnvConfig()),
+        "lift_box": ("lift_box", EnvConfig()),
+        **{
+            title: (title.partition(",")[0], EASIER)
+            for title, name in states.items()
+            if name.endswith("easier")
+        },
+    }
+    experts = {
+        title: next(row.terms for row in references(*form) if row.name == "scripted expert")
+        for title, form in forms.items()
+    }
+    reward_terms(files, DOCS / "images" / "state.png", references=experts)
     for seed in range(3):
         print(f"seed {seed}: {mean_return(f'laptop-seed{seed}'):.1f}")
 

@@ -7,7 +7,7 @@ quoted with their source.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -25,12 +25,14 @@ class Reference:
         returns: its mean return with a 95 % interval; without one both ends are the mean.
         success_end: its rate of success at the end of the episode, likewise; None if not known.
         source: where the number comes from.
+        terms: the mean sum of each of the reward's terms over an episode; empty if not known.
     """
 
     name: str
     returns: Interval
     success_end: Interval | None
     source: str
+    terms: dict[str, float] = field(default_factory=dict)
 
 
 def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]:
@@ -46,6 +48,7 @@ def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]
             Interval(*row["return"]),
             None if row["success_end"] is None else Interval(*row["success_end"]),
             row["source"],
+            row.get("terms", {}),
         )
         for row in _measured().get(form(task, env or EnvConfig()), [])
     )

@@ -4,11 +4,12 @@ import json
 from pathlib import Path
 from statistics import mean
 
+from measure_references import EASIER
+
 from merl.envs import EnvConfig
 from merl.report.figures import learning_curves, reward_terms
 from merl.report.references import references
 
-EASIER = EnvConfig(start=("around", "holding"), goal_reward="both", floor="smooth")
 DOCS = Path(__file__).parent
 
 
@@ -40,7 +41,7 @@ def main() -> None:
         "move_box": ("move_box", EnvConfig()),
         "lift_box": ("lift_box", EnvConfig()),
         **{
-            title: (title.partition(",")[0], EASIER)
+            title: (title.partition(",")[0], EnvConfig(**EASIER))
             for title, name in states.items()
             if name.endswith("easier")
         },

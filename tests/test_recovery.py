@@ -194,8 +194,12 @@ def test_the_same_line_begins_goes_on_and_is_done(
 def test_a_run_that_was_killed_before_its_first_checkpoint_begins(tmp_path: Path, how: str) -> None:
     folder = tmp_path / "run"
     assert main(line(folder, "--steps", "100")) == 0
-    shutil.rmtree(folder / "checkpoints")  # what a kill leaves behind between the two
+    shutil.rmtree(folder / "checkpoints")
     (folder / "metrics.csv").write_text("step\n")
+    assert main(["resume", str(folder)]) == 2  # there are steps in its replay
+    assert (folder / "replay" / "moment.bin").is_file()
+    # What a kill leaves behind before the first checkpoint: a replay of nothing.
+    (folder / "replay" / "moment.bin").write_bytes(bytes(8 * 200))
     (folder / "checkpoints" / ".part-00000000").mkdir(parents=True)
     on = line(folder, "--resume", "--steps", "200") if how == "train" else ["resume", str(folder)]
     assert main(on) == 0

@@ -96,6 +96,23 @@ def test_a_second_save_at_a_step_replaces_the_first(tmp_path: Path) -> None:
     assert (found.score, found.state()) == (3.0, {"a": 2})
 
 
+def test_a_second_save_that_fails_at_the_last_moment_leaves_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path, 100, agent(), {"a": 1}, score=None, keep=1)
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if self.name == ".part-00000100":
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OSError, match="Input/output"):
+        save(tmp_path, 100, agent(), {"a": 2}, score=None, keep=1)
+    assert Checkpoint.find(tmp_path).state() == {"a": 1}
+
+
 def test_going_on_from_before_a_damaged_one_never_loses_the_good_ones(tmp_path: Path) -> None:
     for step in (100, 300):
         save(tmp_path, step, agent(), {}, score=float(step), keep=2)

@@ -154,9 +154,15 @@ def save(
         for path in (*part.iterdir(), part):
             _sync(path)
         final = root / f"{step:08d}"
+        former = root / f".part-{step:08d}-former"
         if final.exists():  # there until the very moment at which the new one takes its place
-            final.rename(root / f".part-{step:08d}-former")
-        part.rename(final)
+            final.rename(former)
+        try:
+            part.rename(final)
+        except OSError:
+            if former.exists():
+                former.rename(final)
+            raise
         _sync(root)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)

@@ -135,11 +135,13 @@ class Run:
         """Clear the folder for a first step, if it was left before its first checkpoint.
 
         Returns:
-            Whether it is so; a run that has saved or measured anything is left as it is.
+            Whether it is so; what has saved, measured or remembered anything is left as it is.
         """
+        if any(path.name.isdigit() for path in self.checkpoints.glob("*")):
+            return False
         metrics = self.path / METRICS_FILE
         has_rows = metrics.exists() and metrics.read_bytes().count(b"\n") > 1
-        if has_rows or any(path.name.isdigit() for path in self.checkpoints.glob("*")):
+        if has_rows or any(np.fromfile(f, "<i8").any() for f in self.replay.rglob("moment.bin")):
             return False
         for folder in (self.replay, self.checkpoints):
             shutil.rmtree(folder, ignore_errors=True)

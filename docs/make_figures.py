@@ -1,30 +1,51 @@
 """Draw the pictures of README and docs from the committed numbers: python docs/make_figures.py."""
 
+import csv
 import json
 from pathlib import Path
 from statistics import mean
 
+import numpy as np
 from measure_references import EASIER
 
 from merl.envs import EnvConfig
+from merl.experiments.small_tasks import SPLIT, optimum, returns_of
+from merl.report.curves import Curve
 from merl.report.figures import learning_curves, reward_terms
 from merl.report.references import references
 
 DOCS = Path(__file__).parent
+DATA, IMAGES = DOCS / "data", DOCS / "images"
+AGENTS = DATA / "agents"
+SENSES = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", "proprio")}
 
 
 def main() -> None:
     """Draw every picture that is made of numbers."""
+    laptop()
+    states()
+    agents()
+    small_tasks()
+    for seed in range(3):
+        print(f"seed {seed}: {mean_return(f'laptop-seed{seed}'):.1f}")
+
+
+def laptop() -> None:
+    """An hour of preset laptop."""
     lines = {row.name: row.returns.mean for row in references("reach_duplo")}
     lines.pop("no motion")
     learning_curves(
-        {"MERL, preset laptop": sorted((DOCS / "data").glob("laptop-seed?.csv"))},
-        DOCS / "images" / "laptop.png",
+        {"MERL, preset laptop": sorted(DATA.glob("laptop-seed?.csv"))},
+        IMAGES / "laptop.png",
         x="minutes",
         references=lines,
         title="reach_duplo",
     )
-    states = {
+
+
+def states() -> None:
+    """What has been learnt from the state, term by term."""
+    runs = {
         "reach_duplo": "reach_duplo",
         "move_box": "move_box",
         "move_box, goal linear to 0.3 m": "move_box-linear30",
@@ -35,14 +56,13 @@ def main() -> None:
         "lift_box, the same, the hand around or holding the box": "lift_box-holding",
         "lift_box, easier: around or holding, both, smooth": "lift_box-easier",
     }
-    files = {title: DOCS / "data" / f"state-{name}-seed0.csv" for title, name in states.items()}
     forms = {
         "reach_duplo": ("reach_duplo", EnvConfig()),
         "move_box": ("move_box", EnvConfig()),
         "lift_box": ("lift_box", EnvConfig()),
         **{
             title: (title.partition(",")[0], EnvConfig(**EASIER))
-            for title, name in states.items()
+            for title, name in runs.items()
             if name.endswith("easier")
         },
     }
@@ -50,14 +70,61 @@ def main() -> None:
         title: next(row.terms for row in references(*form) if row.name == "scripted expert")
         for title, form in forms.items()
     }
-    reward_terms(files, DOCS / "images" / "state.png", references=experts)
-    for seed in range(3):
-        print(f"seed {seed}: {mean_return(f'laptop-seed{seed}'):.1f}")
+    files = {title: DATA / f"state-{name}-seed0.csv" for title, name in runs.items()}
+    reward_terms(files, IMAGES / "state.png", references=experts)
+
+
+def agents() -> None:
+    """The agents beside each other on each task, by what they sense."""
+    for task in ("reach_duplo", "move_box", "lift_box"):
+        form = EnvConfig() if task == "reach_duplo" else EnvConfig(**EASIER)
+        known = {row.name: row.returns.mean for row in references(task, form)}
+        for preset, names in SENSES.items():
+            runs = {
+                f"{agent}, matched": sorted(AGENTS.glob(f"{task}-{agent}-{preset}-matched-s*.csv"))
+                for agent in names
+            }
+            if all(runs.values()):
+                learning_curves(
+                    runs,
+                    IMAGES / f"agents-{task}-{preset}.png",
+                    references=known,
+                    title=f"{task}, preset {preset}",
+                )
+
+
+def small_tasks() -> None:
+    """The dot that only camera and joints together can steer to its mark."""
+    with (DATA / "small_tasks.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["task"] == SPLIT]
+    runs = {
+        f"{agent} ({sense})": [
+            Curve(
+                *np.array(
+                    [
+                        (float(row["step"]), float(row["return"]))
+                        for row in rows
+                        if (row["agent"], row["seed"]) == (agent, seed)
+                    ]
+                ).T
+            )
+            for seed in sorted({row["seed"] for row in rows})
+        ]
+        for agent, sense in (("merl", "both"), ("drqv2", "camera"), ("proprio", "joints"))
+    }
+    still = np.mean(returns_of(lambda env: 0 * env.best_action(), SPLIT))
+    learning_curves(
+        runs,
+        IMAGES / "split.png",
+        band="bootstrap",
+        references={"straight to the mark": optimum(SPLIT), "standing still": float(still)},
+        title="the camera sees the mark, the joints know the dot",
+    )
 
 
 def mean_return(name: str) -> float:
     """Of the episodes in `data/NAME-evaluation.json`."""
-    told = json.loads((DOCS / "data" / f"{name}-evaluation.json").read_text())
+    told = json.loads((DATA / f"{name}-evaluation.json").read_text())
     return mean(episode["return"] for episode in told["episodes"])
 
 

@@ -1,6 +1,6 @@
-"""The small tasks over seeds: python docs/measure_small_tasks.py [SEEDS]. Writes a row per run.
+"""The small tasks over seeds: python docs/measure_small_tasks.py [SEEDS]. A row per evaluation.
 
-Rows that `docs/data/small_tasks.csv` has already are not measured again.
+A run that `docs/data/small_tasks.csv` has to its end is not measured again.
 """
 
 from __future__ import annotations
@@ -9,47 +9,62 @@ import csv
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from merl.experiments.small_tasks import CASES, WHOLE, learn, optimum, returns_of
+from merl.report.curves import read_metrics
+from merl.statistics import bootstrap_interval
 
+EVALUATIONS = 10  # of a run, the last one at its end
 OUTPUT = Path(__file__).parent / "data" / "small_tasks.csv"
-FIELDS = ("task", "agent", "seed", "steps", "return", "low", "high")
+COLUMNS = {"step": "step", "return": "eval/return"} | {
+    end: f"eval/return_{end}" for end in ("low", "high")
+}
+FIELDS = ("task", "agent", "seed", *COLUMNS)
 
 
 def main() -> None:
     """Measure what is missing, then print the means."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     rows = _read()
-    known = {(row["task"], row["agent"], row["seed"], row["steps"]) for row in rows}
     for task, agent, steps in CASES:
         for seed in range(seeds):
-            if (task, agent, str(seed), str(steps)) in known:
+            this = {"task": task, "agent": agent, "seed": str(seed)}
+            if any(row == row | this | {"step": str(steps)} for row in rows):
                 continue
-            with tempfile.TemporaryDirectory() as folder:
-                result = learn(task, agent, seed=seed, steps=steps, run_dir=Path(folder) / "run")
-            mean, low, high = (f"{value:.2f}" for value in result.returns)
-            row = dict(zip(FIELDS, (task, agent, seed, steps, mean, low, high), strict=True))
-            rows.append({key: str(value) for key, value in row.items()})
+            rows += [this | row for row in measured(task, agent, seed, steps)]
             _write(rows)
-            print(*row.values(), flush=True)
+            print(*rows[-1].values(), flush=True)
     best, still = optimum(WHOLE), np.mean(returns_of(lambda env: 0 * env.best_action(), WHOLE))
     print(f"the dot: straight to the mark {best:.2f}, standing still {still:.2f}")
     for task, agent, steps in CASES:
-        told = [float(r["return"]) for r in rows if (r["task"], r["agent"]) == (task, agent)]
-        print(f"{task} {agent}, {steps} steps, {len(told)} seeds: mean {np.mean(told):.2f}", told)
+        this = {"task": task, "agent": agent, "step": str(steps)}
+        told = [float(row["return"]) for row in rows if row == row | this]
+        mean, low, high = bootstrap_interval(told)
+        print(f"{task} {agent}, {steps} steps: {mean:.2f} [{low:.2f}, {high:.2f}]", sorted(told))
 
 
-def _read() -> list[dict[str, Any]]:
+def measured(task: str, agent: str, seed: int, steps: int) -> list[dict[str, str]]:
+    """Every evaluation of one run."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        learn(task, agent, seed=seed, steps=steps, run_dir=run, evaluations=EVALUATIONS)
+        metrics = read_metrics(run)
+    return [
+        {field: f"{metrics[column][row]:.7g}" for field, column in COLUMNS.items()}
+        for row in np.flatnonzero(~np.isnan(metrics["eval/return"]))
+    ]
+
+
+def _read() -> list[dict[str, str]]:
     if not OUTPUT.exists():
         return []
     with OUTPUT.open() as file:
         return list(csv.DictReader(file))
 
 
-def _write(rows: list[dict[str, Any]]) -> None:
+def _write(rows: list[dict[str, str]]) -> None:
     with OUTPUT.open("w", newline="") as file:
         writer = csv.DictWriter(file, FIELDS)
         writer.writeheader()

@@ -48,8 +48,10 @@ _DOT_DISCOUNT = 0.8
 """The mark is at most ten steps away; a longer horizon only makes the values slow to grow."""
 
 
-def small_config(task: str, agent: str, *, seed: int, steps: int, run_dir: Path) -> TrainConfig:
-    """How an agent is trained on a small task."""
+def small_config(
+    task: str, agent: str, *, seed: int, steps: int, run_dir: Path, evaluations: int = 1
+) -> TrainConfig:
+    """How an agent is trained on a small task, and how often it is evaluated on the way."""
     chosen = AGENTS[agent]
     values, discount = (_PENDULUM, 0.99) if task == PENDULUM else (_DOT, _DOT_DISCOUNT)
     if chosen.noise_std_end is not None:
@@ -69,13 +71,17 @@ def small_config(task: str, agent: str, *, seed: int, steps: int, run_dir: Path)
         env=EnvConfig(renderer="warp"),
         replay=ReplayConfig(batch_size=64, frame_stack=1, discount=discount),
         agent=dataclasses.replace(chosen, **values),
-        eval=EvaluationConfig(every=steps, episodes=20, video="none"),
+        eval=EvaluationConfig(every=steps // evaluations, episodes=20, video="none"),
     )
 
 
-def learn(task: str, agent: str, *, seed: int, steps: int, run_dir: Path) -> Evaluation:
-    """Train, and evaluate over 20 episodes without noise."""
-    config = small_config(task, agent, seed=seed, steps=steps, run_dir=run_dir)
+def learn(
+    task: str, agent: str, *, seed: int, steps: int, run_dir: Path, evaluations: int = 1
+) -> Evaluation:
+    """Train, and evaluate over 20 episodes without noise; all evaluations are in its metrics."""
+    config = small_config(
+        task, agent, seed=seed, steps=steps, run_dir=run_dir, evaluations=evaluations
+    )
     with Parts.prepare(config, new=True) as parts:
         outcome = trainer.start(parts, _Silent())
     assert outcome.evaluation is not None

@@ -5,7 +5,7 @@
 # goes on. Two at once on two cores:
 #     docs/measure_agents.sh 0 & docs/measure_agents.sh 1 & wait
 # PRESET (state), STEPS (100000), AGENTS, TASKS and SETTING (matched or published) may be set:
-#     PRESET=laptop TASKS=reach_duplo AGENTS="merl drqv2 proprio" STEPS=60000 docs/measure_agents.sh
+#     PRESET=laptop TASKS=reach_duplo AGENTS="merl drqv2 proprio" STEPS=40000 docs/measure_agents.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
 preset=${PRESET:-state} steps=${STEPS:-100000} setting=${SETTING:-matched}
@@ -22,9 +22,11 @@ for seed in "$@"; do
       fi
       form=
       if [ "$task" != reach_duplo ]; then form=$easier; fi
-      if [ -n "$form" ] && [ "$agent" != sac ] && [ "$setting" = matched ]; then
-        form="$form --agent.noise-std 0.1" # SAC's noise is its own
-      fi
+      case $agent-$setting in
+        sac-* | *-published) ;; # their noise is their own
+        drqv2-*) form="$form --agent.noise-steps $((steps / 2))" ;;
+        *) if [ -n "$form" ]; then form="$form --agent.noise-std 0.1"; fi ;;
+      esac
       # shellcheck disable=SC2086 # the form is a list of flags
       merl train "$task" --agent "$agent" --setting "$setting" --preset "$preset" --steps "$steps" \
         --seed "$seed" --threads 1 --eval.video none $form --run-dir "$run" --resume

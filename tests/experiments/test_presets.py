@@ -51,10 +51,12 @@ def test_published_is_what_the_authors_ran() -> None:
     assert (drqv2.agent.noise(0), drqv2.agent.noise(500_000)) == (1.0, pytest.approx(0.55))
     assert drqv2.agent.noise(10**7) == pytest.approx(0.1)
     assert drqv2.agent == dataclasses.replace(AGENTS["drqv2"], noise_steps=1_000_000)
-    ddpg = compose("state", "reach_duplo", "ddpg", "published").agent
-    assert (ddpg.noise_std, ddpg.noise_clip, ddpg.hidden_dim) == (0.1, 0.0, 256)
+    ddpg = compose("state", "reach_duplo", "ddpg", "published")
+    assert (ddpg.agent.noise_std, ddpg.agent.noise_clip, ddpg.agent.hidden_dim) == (0.1, 0.0, 256)
+    assert (ddpg.replay.n_step, ddpg.random_steps, ddpg.seed_steps) == (1, 25_000, 25_000)
     sac = compose("state", "reach_duplo", "sac", "published")
     assert (sac.replay.n_step, sac.agent.learning_rate, sac.agent.tau) == (1, 3e-4, 0.005)
+    assert (sac.random_steps, sac.seed_steps) == (10_000, 10_000)
     for name in PUBLISHED:
         assert compose("laptop", "x", name, "published").setting == "published"
         assert compose("laptop", "x", name).setting == "matched"

@@ -148,11 +148,10 @@ class DDPG:
     ) -> dict[str, Tensor]:
         """Eq. 1: both Q-functions towards y; encoders and the critic's fusion learn with them."""
         networks = self.networks
+        # Apart: autocast would hand weights that it cast without a gradient to what needs one.
+        with self._arithmetic(), torch.no_grad():
+            y = batch.reward + batch.discount * self.next_value(next_encoded, next_noise)  # (B,)
         with self._arithmetic():
-            with torch.no_grad():
-                y = batch.reward + batch.discount * self.next_value(
-                    next_encoded, next_noise
-                )  # (B,)
             latent = networks.critic_fusion(encoded)  # (B, d)
             q1, q2 = networks.critic(latent, batch.action)
         loss = (q1 - y).square().mean() + (q2 - y).square().mean()

@@ -119,7 +119,7 @@ PUBLISHED: dict[str, Published] = {
     # TD3's own repository, whose DDPG acts with noise and learns without.
     "ddpg": Published(
         {"updates_per_step": 1.0, "random_steps": 25_000, "seed_steps": 25_000},
-        {"batch_size": 256},
+        {"batch_size": 256, "n_step": 1},
         {
             "learning_rate": 3e-4,
             "tau": 0.005,
@@ -128,9 +128,9 @@ PUBLISHED: dict[str, Published] = {
             "noise_clip": 0.0,
         },
     ),
-    # Haarnoja et al. 2018b, Table 1, and its own repository for the random start.
+    # Haarnoja et al. 2018b, Table 1; its own repository begins with ten episodes at random.
     "sac": Published(
-        {"updates_per_step": 1.0, "random_steps": 1000, "seed_steps": 1000},
+        {"updates_per_step": 1.0, "random_steps": 10_000, "seed_steps": 10_000},
         {"batch_size": 256, "n_step": 1},
         {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
     ),

@@ -1,0 +1,144 @@
+"""Our update of DrQ-v2 beside its authors': python docs/compare_with_drqv2.py PATH/TO/drqv2.
+
+PATH is a clone of github.com/facebookresearch/drqv2. Both begin with the same weights and are given
+the same batches, crops and noise, in float64; then losses and weights are compared.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import types
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor, nn
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "agents"))
+from bridge import Case, double, draws_of, error, weather
+from reference import Chance
+
+from merl.agents.ddpg import DDPG
+from merl.agents.drqv2 import DrQV2Config
+from merl.core import Batch
+
+DECISION = 200_000  # of the 500,000 over which the noise falls
+CONFIG = replace(DrQV2Config(), hidden_dim=64, precision="fp32", noise_steps=1_000_000)
+CASE = Case("drqv2", CONFIG, {"image": (84, 84, 3)}, {}, batch=6, step=2 * DECISION)
+SIDE, CHANNELS = 35, 32  # of the encoder's last feature map
+
+
+def main() -> None:
+    """Four updates of either."""
+    theirs, utils = made_by_its_authors(Path(sys.argv[1]))
+    ours = double(CASE.agent())
+    weather(ours)
+    with torch.no_grad():
+        for _, mine, other in weights(ours, theirs):
+            other.copy_(theirs_from(mine))
+    for update in range(4):
+        batch, chance = CASE.batch_of(update, torch.float64), CASE.chance_of(update)
+        found = ours.learn(batch, draws_of(chance, CONFIG, torch.float64, CASE.step))
+        told = updated(theirs, utils, batch, chance)
+        for name in ("critic_loss", "actor_loss"):
+            print(f"update {update + 1}, {name}: {float(found[name]):.9f} and {told[name]:.9f}")
+    worst: dict[str, float] = {}
+    for part, mine, other in weights(ours, theirs):
+        apart = error(theirs_from(mine).detach(), other.detach())
+        worst[part] = max(worst.get(part, 0.0), apart)
+    for part, apart in worst.items():
+        print(f"weights of {part}: apart by {apart:.1e} of their norm")
+
+
+def updated(theirs: Any, utils: Any, batch: Batch, chance: Chance) -> dict[str, float]:
+    """Their update of this batch with this chance, which they would draw themselves."""
+    crops = map(crop, (chance.shift["image"], chance.shift_next["image"]))
+    noises = iter((chance.noise_next, chance.noise))
+    given = (
+        frames(batch.observation["image"]),
+        batch.action,
+        batch.reward[:, None],
+        batch.discount[:, None],
+        frames(batch.next_observation["image"]),
+    )
+
+    def normal(*_: Any, **__: Any) -> Tensor:
+        return next(noises).clone()
+
+    with (
+        mock.patch.object(torch, "randint", side_effect=crops),
+        mock.patch.object(utils, "_standard_normal", normal),
+        mock.patch.object(Tensor, "float", Tensor.double),
+    ):
+        told: dict[str, float] = theirs.update(iter([given]), DECISION)
+    return told
+
+
+def made_by_its_authors(folder: Path) -> tuple[Any, types.ModuleType]:
+    """Their agent and their utilities; of Hydra, which they import, nothing is needed here."""
+    for name in ("hydra", "omegaconf"):
+        sys.modules[name] = types.ModuleType(name)
+    sys.modules["omegaconf"].OmegaConf = None  # type: ignore[attr-defined]
+    sys.path.insert(0, str(folder))
+    module, utils = importlib.import_module("drqv2"), importlib.import_module("utils")
+    agent = module.DrQV2Agent(
+        obs_shape=(9, 84, 84),
+        action_shape=CASE.batch_of(0).action.shape[1:],
+        device=torch.device("cpu"),
+        lr=CONFIG.learning_rate,
+        feature_dim=CONFIG.latent_dim,
+        hidden_dim=CONFIG.hidden_dim,
+        critic_target_tau=CONFIG.tau,
+        num_expl_steps=0,
+        update_every_steps=2,
+        stddev_schedule="linear(1.0,0.1,500000)",
+        stddev_clip=CONFIG.noise_clip,
+        use_tb=True,
+    )
+    for part in (agent.encoder, agent.actor, agent.critic, agent.critic_target):
+        part.double()
+    return agent, utils
+
+
+def weights(ours: DDPG, theirs: Any) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """Every weight of either side, and what it belongs to."""
+    networks, average = ours.networks, ours.critic_target
+    pairs: dict[str, tuple[nn.Module, nn.Module]] = {
+        "the encoder": (networks.encoders, theirs.encoder),
+        "the critic's trunk": (networks.critic_fusion, theirs.critic.trunk),
+        "the actor's trunk": (networks.actor_fusion, theirs.actor.trunk),
+        "the actor": (networks.actor, theirs.actor.policy),
+        "Q1": (networks.critic.q1, theirs.critic.Q1),
+        "Q2": (networks.critic.q2, theirs.critic.Q2),
+        "the averaged trunk": (average["critic_fusion"], theirs.critic_target.trunk),
+        "the averaged Q1": (average["critic"].q1, theirs.critic_target.Q1),
+        "the averaged Q2": (average["critic"].q2, theirs.critic_target.Q2),
+    }
+    for part, (mine, other) in pairs.items():
+        for one, two in zip(mine.parameters(), other.parameters(), strict=True):
+            yield part, one, two
+
+
+def theirs_from(weight: Tensor) -> Tensor:
+    """In their order: a trunk reads channels, rows, columns; ours rows, columns, channels."""
+    if weight.shape[-1] != SIDE * SIDE * CHANNELS:
+        return weight
+    return weight.unflatten(1, (SIDE, SIDE, CHANNELS)).permute(0, 3, 1, 2).flatten(1)
+
+
+def frames(stack: Tensor) -> Tensor:
+    """(B, K, H, W, C) to their (B, K C, H, W)."""
+    return stack.permute(0, 1, 4, 2, 3).flatten(1, 2)
+
+
+def crop(shift: Tensor) -> Tensor:
+    """A crop's row and column as their column and row, (B, 1, 1, 2)."""
+    return shift.flip(-1)[:, None, None].double()
+
+
+if __name__ == "__main__":
+    main()

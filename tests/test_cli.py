@@ -254,6 +254,8 @@ BAD = {
     "train": "missing from merl train: TASK",
     "train reach_dulpo": "did you mean 'reach_duplo'",
     "train reach_duplo --stepz 4": "did you mean --steps",
+    "train --stepz 4 reach_duplo": "unrecognized options: --stepz",
+    "resume --stepz 4 somewhere": "unrecognized options: --stepz",
     "train reach_duplo --preset lptop": "did you mean 'laptop'",
     "train reach_duplo --preset=": "preset '' is unknown",
     "train reach_duplo --steps 0": "steps must be at least 1",

@@ -22,6 +22,20 @@ T = TypeVar("T")
 
 def parse(target: Callable[..., T], prog: str, args: list[str], **options: Any) -> T:
     """Tyro's parser, with its errors in one line."""
+    try:
+        return _parsed(target, prog, args, options)
+    except MerlError as error:
+        # Tyro takes what follows an unknown flag for the flag's, and then finds it missing.
+        if str(error).startswith("missing value for argument"):
+            try:
+                _parsed(target, prog, ["x", *args], options)
+            except MerlError as other:
+                if str(other).startswith("unrecognized"):
+                    raise other from None
+        raise
+
+
+def _parsed(target: Callable[..., T], prog: str, args: list[str], options: dict[str, Any]) -> T:
     errors = io.StringIO()
     columns = os.environ.get("COLUMNS")
     asks_help = any(arg in ("-h", "--help") for arg in args)

@@ -37,13 +37,26 @@ def shift(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
 def _shift_by_slices(
     images: NDArray[np.uint8], shifts: NDArray[np.int64], pad: int
 ) -> NDArray[np.uint8]:
-    """A slice per sample: rows are copied whole, 15x faster than an index per pixel."""
+    """A slice per sample, and the edges from beside it: rows are copied whole, and once."""
     height, width = images.shape[2:4]
-    sides = (pad, pad)
-    padded = np.pad(images, ((0, 0), (0, 0), sides, sides, (0, 0)), mode="edge")
     shifted = np.empty_like(images)
-    for sample, (row, column) in enumerate(shifts.tolist()):
-        shifted[sample] = padded[sample, :, row : row + height, column : column + width]
+    for image, moved, (row, column) in zip(images, shifted, shifts.tolist(), strict=True):
+        # What comes to (y, x) was at (y + down, x + right); further than the last edge is as far.
+        down = min(max(row - pad, 1 - height), height - 1)
+        right = min(max(column - pad, 1 - width), width - 1)
+        top, bottom = max(-down, 0), height - max(down, 0)
+        left, side = max(-right, 0), width - max(right, 0)
+        moved[:, top:bottom, left:side] = image[
+            :, top + down : bottom + down, left + right : side + right
+        ]
+        if right:
+            edge = left if right < 0 else side - 1
+            beyond = slice(left) if right < 0 else slice(side, None)
+            moved[:, top:bottom, beyond] = moved[:, top:bottom, edge : edge + 1]
+        if down:
+            edge = top if down < 0 else bottom - 1
+            beyond = slice(top) if down < 0 else slice(bottom, None)
+            moved[:, beyond] = moved[:, edge : edge + 1]
     return shifted
 
 

@@ -1,7 +1,11 @@
-"""Our update of DrQ-v2 beside its authors': python docs/compare_with_drqv2.py PATH/TO/drqv2.
+"""Our update of DrQ-v2 beside its authors', of which PATH is a clone (facebookresearch/drqv2).
 
-PATH is a clone of github.com/facebookresearch/drqv2. Both begin with the same weights and are given
-the same batches, crops and noise, in float64; then losses and weights are compared.
+    python docs/compare_with_drqv2.py PATH              # what is computed
+    python docs/compare_with_drqv2.py PATH --repeats 9  # how long it takes
+
+Both begin with the same weights and are given the same batches, crops and noise, in float64; then
+losses and weights are compared. Timed is the full size in single precision, in turns with what
+`merl bench update` holds to be a plain DrQ-v2.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ from typing import Any
 from unittest import mock
 
 import torch
+import tyro
 from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "agents"))
@@ -24,6 +29,8 @@ from reference import Chance
 
 from merl.agents.ddpg import DDPG
 from merl.agents.drqv2 import DrQV2Config
+from merl.bench.measuring import circumstances, shown, spread, take_turns
+from merl.bench.update import ACTIONS, as_sample, noise_batch, reference_of
 from merl.core import Batch
 
 DECISION = 200_000  # of the 500,000 over which the noise falls
@@ -32,9 +39,37 @@ CASE = Case("drqv2", CONFIG, {"image": (84, 84, 3)}, {}, batch=6, step=2 * DECIS
 SIDE, CHANNELS = 35, 32  # of the encoder's last feature map
 
 
-def main() -> None:
+def main(path: tyro.conf.Positional[Path], repeats: int = 0) -> None:
+    """Compare four updates; or, with repeats, time them."""
+    if repeats:
+        time(path, repeats)
+    else:
+        compare(path)
+
+
+def time(path: Path, repeats: int) -> None:
+    """An update of theirs in turns with the reference's."""
+    theirs, _ = made_by_its_authors(path, hidden_dim=1024, actions=ACTIONS)
+    sample, plain = as_sample(noise_batch(256), vector=False), reference_of("drqv2")
+    given = (sample.image, sample.action, sample.reward, sample.discount, sample.next_image)
+    turns = take_turns(
+        {
+            "its authors'": lambda: theirs.update(iter([given]), DECISION),
+            "the reference": lambda: plain.update(sample),
+        },
+        repeats,
+    )
+    for side, seconds in turns.items():
+        print(f"{side}: {shown(spread([1 / one for one in seconds]))} updates/s")
+    ratio = [a / b for a, b in zip(*turns.values(), strict=True)]
+    print(f"the reference is {shown(spread(ratio))} times as fast, {circumstances()['machine']}")
+
+
+def compare(path: Path) -> None:
     """Four updates of either."""
-    theirs, utils = made_by_its_authors(Path(sys.argv[1]))
+    theirs, utils = made_by_its_authors(path, CONFIG.hidden_dim, actions=6)
+    for part in (theirs.encoder, theirs.actor, theirs.critic, theirs.critic_target):
+        part.double()
     ours = double(CASE.agent())
     weather(ours)
     with torch.no_grad():
@@ -78,7 +113,9 @@ def updated(theirs: Any, utils: Any, batch: Batch, chance: Chance) -> dict[str, 
     return told
 
 
-def made_by_its_authors(folder: Path) -> tuple[Any, types.ModuleType]:
+def made_by_its_authors(
+    folder: Path, hidden_dim: int, actions: int
+) -> tuple[Any, types.ModuleType]:
     """Their agent and their utilities; of Hydra, which they import, nothing is needed here."""
     for name in ("hydra", "omegaconf"):
         sys.modules[name] = types.ModuleType(name)
@@ -87,11 +124,11 @@ def made_by_its_authors(folder: Path) -> tuple[Any, types.ModuleType]:
     module, utils = importlib.import_module("drqv2"), importlib.import_module("utils")
     agent = module.DrQV2Agent(
         obs_shape=(9, 84, 84),
-        action_shape=CASE.batch_of(0).action.shape[1:],
+        action_shape=(actions,),
         device=torch.device("cpu"),
         lr=CONFIG.learning_rate,
         feature_dim=CONFIG.latent_dim,
-        hidden_dim=CONFIG.hidden_dim,
+        hidden_dim=hidden_dim,
         critic_target_tau=CONFIG.tau,
         num_expl_steps=0,
         update_every_steps=2,
@@ -99,8 +136,6 @@ def made_by_its_authors(folder: Path) -> tuple[Any, types.ModuleType]:
         stddev_clip=CONFIG.noise_clip,
         use_tb=True,
     )
-    for part in (agent.encoder, agent.actor, agent.critic, agent.critic_target):
-        part.double()
     return agent, utils
 
 
@@ -141,4 +176,4 @@ def crop(shift: Tensor) -> Tensor:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -74,7 +74,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
         return work
 
     result: dict[str, Any] = {"repeats": repeats, "batch_size": batch_size} | circumstances()
-    batch = _batch(batch_size).to(device)
+    batch = noise_batch(batch_size).to(device)
     replay = OnDevice([_noise()], device) if on_gpu else None
     sides: dict[str, Work] = {}
     of: dict[str, str] = {}
@@ -198,7 +198,7 @@ def _space() -> spaces.Dict:
     )
 
 
-def _batch(size: int) -> Batch:
+def noise_batch(size: int) -> Batch:
     """A batch of noise, always the same."""
     generator = torch.Generator().manual_seed(0)
 

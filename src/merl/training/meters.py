@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 from torch import Tensor
 
@@ -72,3 +73,26 @@ class Clock:
             "time/steps_per_second": (progress.step - steps) / span,
             "time/updates_per_second": (progress.updates - updates) / span,
         }
+
+
+class Interval:
+    """When to save, where that can be done only now and then: at an episode's end.
+
+    Args:
+        seconds: that may lie between two saves.
+        now: tells the time, in seconds.
+    """
+
+    def __init__(self, seconds: float, now: Callable[[], float] = time.perf_counter) -> None:
+        self._seconds, self._now = seconds, now
+        self._saved = self._chance = now()
+
+    def is_due(self) -> bool:
+        """At a chance to save: whether the next one, as far away as the last, would be too late."""
+        now = self._now()
+        apart, self._chance = now - self._chance, now
+        return now + apart - self._saved > self._seconds
+
+    def saved(self) -> None:
+        """A save is done, or was tried."""
+        self._saved = self._chance = self._now()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -16,7 +15,7 @@ from merl.training.checkpoint import Checkpoint
 from merl.training.evaluation import Evaluation, Policy, evaluate
 from merl.training.guards import LossGuard
 from merl.training.loop import Moment, Progress, Stage, train
-from merl.training.meters import Averages, Clock
+from merl.training.meters import Averages, Clock, Interval
 from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
 from merl.training.rollout import FrameStack, mean_metrics
@@ -90,7 +89,7 @@ class Stretch:
         self.evaluation: Evaluation | None = None
         self.losses = 0
         self._states: list[dict[str, Any] | None] = [None] * environments.count
-        self._saved = time.perf_counter()
+        self._interval = Interval(self.config.save_every)
 
     def train(self) -> Outcome:
         """Drive the loop; between its steps log, evaluate, save, and see whether to stop."""
@@ -183,7 +182,7 @@ class Stretch:
         if due and progress.step < self.config.steps:  # the last one comes after the loop
             self._evaluate()
             self._save()
-        elif time.perf_counter() - self._saved > self.config.save_every:
+        elif self._interval.is_due():
             self._save()
 
     def _log(self, moment: Moment) -> dict[str, float]:
@@ -271,7 +270,7 @@ class Stretch:
             self.view.warn(f"the checkpoint at step {progress.step} was not written: {reason}")
             return False
         finally:
-            self._saved = time.perf_counter()
+            self._interval.saved()
         self.replay.settle()
         self.view.saved(progress.step)
         return True

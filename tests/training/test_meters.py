@@ -1,0 +1,35 @@
+"""When a run saves: never later than asked for, as long as an episode is shorter than that."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from merl.training.meters import Interval
+
+
+@pytest.mark.parametrize(
+    ("episode", "most"),
+    [(7.0, 294.0), (120.0, 240.0), (299.0, 299.0), (300.0, 300.0), (400.0, 400.0)],
+)
+def test_saves_lie_as_far_apart_as_they_may(episode: float, most: float) -> None:
+    clock = [0.0]
+    interval = Interval(300.0, lambda: clock[0])
+    saves = [0.0]
+    for _ in range(200):
+        clock[0] += episode
+        if interval.is_due():
+            saves.append(clock[0])
+            clock[0] += 0.5  # that a save takes
+            interval.saved()
+    apart = [after - before for before, after in pairwise(saves)]
+    assert max(apart) == pytest.approx(most, abs=1.0)
+    assert min(apart) >= most - 1.0
+
+
+def test_an_interval_of_nothing_is_always_over() -> None:
+    clock = [0.0]
+    interval = Interval(0.0, lambda: clock[0])
+    clock[0] += 1e-3
+    assert interval.is_due()

@@ -13,6 +13,7 @@ from merl.experiments.small_tasks import SPLIT, optimum, returns_of
 from merl.report.curves import Curve
 from merl.report.figures import learning_curves, reward_terms
 from merl.report.references import references
+from merl.statistics import bootstrap_interval, wilson_interval
 
 DOCS = Path(__file__).parent
 DATA, IMAGES = DOCS / "data", DOCS / "images"
@@ -26,8 +27,24 @@ def main() -> None:
     states()
     agents()
     small_tasks()
+    for file in sorted(AGENTS.glob("*-evaluation.json")):
+        print(evaluated(file))
     for seed in range(3):
         print(f"seed {seed}: {mean_return(f'laptop-seed{seed}'):.1f}")
+
+
+def evaluated(file: Path) -> str:
+    """A row of a table: what an evaluation came to, with its 95 % intervals."""
+    told = json.loads(file.read_text())
+    episodes = told["episodes"]
+    mean, low, high = bootstrap_interval([episode["return"] for episode in episodes])
+    cells = [file.name.removesuffix("-evaluation.json"), f"{told['step']:,}"]
+    cells.append(f"{mean:.1f} [{low:.1f}, {high:.1f}]")
+    for name in ("success_end", "success_any"):
+        count = int(sum(episode[name] for episode in episodes))
+        rate, low, high = (100 * part for part in wilson_interval(count, len(episodes)))
+        cells.append(f"{rate:.0f} % [{low:.0f}, {high:.0f}]")
+    return f"| {' | '.join(cells)} |"
 
 
 def laptop() -> None:
@@ -98,7 +115,7 @@ def small_tasks() -> None:
     with (DATA / "small_tasks.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["task"] == SPLIT]
     runs = {
-        f"{agent} ({sense})": [
+        f"{agent}, {sense}": [
             Curve(
                 *np.array(
                     [

@@ -75,19 +75,7 @@ def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
         assert "Traceback" not in done.stderr
         return done.stdout + done.stderr
 
-    # 128 does not split over three senses: the line says so, and what would.
-    said = subprocess.run(
-        [sys.executable, "-m", "merl.cli", "train", "my_arm:Arm", *SHORT],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert said.returncode == 2
-    assert "128 does not split evenly over 3 modalities" in said.stderr
-    assert not (tmp_path / "runs").exists()
-
-    said_all = call("train", "my_arm:Arm", *SHORT, "--agent.latent-dim", "96")
+    said_all = call("train", "my_arm:Arm", *SHORT)  # d = 128: 42 for each of three senses
     assert "'gear' is not used" in said_all
     assert "there will be no videos" in said_all
     assert "random actions" in said_all
@@ -157,12 +145,131 @@ def test_pendulum(agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert driven == told
 
 
+FAILING = """
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+
+LIMIT = 1.5
+
+
+class Arm(gymnasium.Env):
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self.observation_space = spaces.Dict({"joints": spaces.Box(-9, 9, (4,), np.float32)})
+        self.action_space = spaces.Box(-LIMIT, LIMIT, (2,), np.float32)
+        self.drawn = self.taken = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.see(), {}
+
+    def step(self, action):
+        self.taken += 1
+        if WHEN == "step" and self.taken == 250:
+            raise OSError("servo 3 does not answer")
+        if WHEN == "evaluation" and self.taken == 40 and self.render_mode:
+            return {"joints": np.full(4, np.nan, np.float32)}, 0.0, False, False, {}
+        return self.see(), -float(np.square(action).sum()), False, False, {}
+
+    def see(self):
+        boxes = self.observation_space.spaces.items()
+        return {key: self.np_random.normal(size=b.shape).astype(np.float32) for key, b in boxes}
+
+    def render(self):
+        self.drawn += 1
+        if WHEN == "render" and self.drawn > 12:
+            raise RuntimeError("the display is gone")
+        return np.zeros((32, 32, 3), np.uint8)
+
+
+def make(render_mode=None):
+    return TimeLimit(Arm(render_mode), 20)
+"""
+
+
+def failing(folder: Path, when: str) -> str:
+    """A module that fails then; its name, which no other test has."""
+    name = f"arm_that_fails_{when}"
+    (folder / f"{name}.py").write_text(f"WHEN = {when!r}\n{FAILING}")
+    return f"{name}:make"
+
+
+def test_what_the_users_code_raises_is_told_and_the_run_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    task = failing(tmp_path, "step")
+    assert main(["train", task, *SHORT, "--eval.video", "none", "--run-dir", "run"]) == 4
+    error = capsys.readouterr().err.strip()
+    assert "step raised OSError: servo 3 does not answer (arm_that_fails_step.py, line 2" in error
+    assert "go on with `merl resume run`" in error
+    assert len(error.splitlines()) == 1
+    saved = max(int(path.name) for path in Path("run/checkpoints").iterdir())
+    assert saved > 0
+    module = Path("arm_that_fails_step.py")
+    module.write_text(module.read_text().replace("self.taken == 250", "False"))
+    sys.modules.pop("arm_that_fails_step")
+    assert main(["resume", "run"]) == 0
+    assert rows(Path("run"))[-1]["step"] == "240"
+
+
+def test_a_film_that_fails_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", failing(tmp_path, "render"), *SHORT, "--run-dir", "run"]) == 0
+    assert "render raised RuntimeError: the display is gone" in capsys.readouterr().out
+
+
+def test_a_nan_in_an_evaluation_stops_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", failing(tmp_path, "evaluation"), *SHORT, "--run-dir", "run"]) == 3
+    assert "'joints' is nan in place 0 at step" in capsys.readouterr().err
+
+
+def test_an_arm_that_has_become_another_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    task = failing(tmp_path, "never")
+    short = [*SHORT, "--eval.video", "none", "--eval.no-references"]
+    assert main(["train", task, *short, "--run-dir", "run"]) == 0
+    assert "there is nothing to compare with" in capsys.readouterr().out
+    module = Path("arm_that_fails_never.py")
+    whole = module.read_text()
+    for change, says in {
+        ("LIMIT = 1.5", "LIMIT = 9.5"): "bounds was low [-1.5, -1.5], high [1.5, 1.5] and is low",
+        ("(4,)", "(5,)"): "'joints' was float32 (4,) and is float32 (5,)",
+        ('"joints": spaces', '"more": spaces.Box(0, 1, (1,)), "joints": spaces'): "'more' was not",
+        ("(2,), np", "(3,), np"): "action was float32 (2,) and is float32 (3,)",
+    }.items():
+        module.write_text(whole.replace(*change))
+        for line in (["resume", "run", "--steps", "300"], ["evaluate", "run"]):
+            sys.modules.pop("arm_that_fails_never")
+            assert main(line) == 2, (change, line)
+            error = capsys.readouterr().err.strip()
+            assert says in error.splitlines()[-1]
+    # a module of the same name elsewhere is not taken for the run's
+    module.write_text(whole)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / module).write_text(whole.replace("(4,)", "(7,)"))
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    sys.modules.pop("arm_that_fails_never")
+    assert main(["evaluate", "../run"]) == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         (["CartPole-v1"], "actions are Discrete(2)"),
         (["Pendulum-v1"], "take --agent merl_state, ddpg or sac"),
-        (["Pendulum-v1", "--agent", "drqv2"], "it needs an image"),
+        (["Pendulum-v1", "--agent", "drqv2"], "or take --agent merl_state, ddpg or sac"),
         (["merl.envs.dot:whole", "--agent", "sac"], "agent.vectors names 'state'"),
         (["Pendulum-v1", "--agent", "ddgp"], "did you mean 'ddpg'"),
         (["Pendulum-v1", "--agent", "ddpg", "--renderer", "gl"], "--renderer is for merl's own"),

@@ -52,6 +52,12 @@ class EnvironmentsLost(MerlError):  # noqa: N818 (what happened, not a mistake)
     exit_code = 4
 
 
+class EnvironmentFailed(MerlError):  # noqa: N818 (what happened, not a mistake)
+    """The user's environment raised an exception, or gave what is no observation, reward or end."""
+
+    exit_code = 4
+
+
 def meant(name: str, known: Iterable[str]) -> str:
     """The way out of a name that is unknown: what was perhaps meant, or all that there is."""
     close = get_close_matches(name, list(known), n=1)

@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from merl.core import MerlError
+from merl.core import EnvironmentFailed, MerlError, NotFinite
 from merl.envs.own import adapt, make_own
 
 
@@ -187,3 +187,100 @@ def test_the_dot(task: str) -> None:
     assert returns["still"] < returns["straight"] <= 20
     assert env.reset(seed=1)[0]["image"][..., 0].any() == task.endswith("whole")
     assert np.asarray(env.render())[..., 0].any()
+
+
+class Misgiving(Given):
+    """Gives from `reset` and `step` what it is told to."""
+
+    def __init__(self, reset: Any = None, step: Any = None) -> None:
+        super().__init__(spaces.Dict({"arm": vector(2), "eye": image(20, 30, 3)}))
+        self.from_reset, self.from_step = reset, step
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.from_reset or (self.seen(), {})
+
+    def step(self, action: Any) -> Any:
+        return self.from_step(self.seen())
+
+    def seen(self) -> dict[str, Any]:
+        return {"arm": np.zeros(2), "eye": np.zeros((20, 30, 3), np.uint8)}
+
+
+@pytest.mark.parametrize(
+    ("step", "says"),
+    [
+        (lambda o: (o, 0.0, False, {}), "step gave 4 values: it must return observation, reward"),
+        (lambda o: None, "step gave NoneType"),
+        (lambda o: (o, None, False, False, {}), "reward is None: it must be a number"),
+        (lambda o: (o, np.zeros(2), False, False, {}), "reward is array"),
+        (lambda o: (o, 0.0, np.zeros(2), False, {}), "terminated is array"),
+        (lambda o: (o, 0.0, False, False, None), "info is None: it must be a dict"),
+        (lambda o: (o, 0.0, False, False, {"reward_terms": [1]}), "must be a dict of numbers"),
+        (lambda o: (o, 0.0, False, False, {"reward_terms": {"a": "b"}}), "reward term 'a' is 'b'"),
+        (lambda o: (o, 0.0, False, False, {"success": np.zeros(2)}), "must be true or false"),
+        (lambda o: (None, 0.0, False, False, {}), "observation is of NoneType"),
+        (lambda o: ({"arm": o["arm"]}, 0.0, False, False, {}), "lacks 'eye'"),
+        (lambda o: (o | {"arm": np.zeros(3)}, 0.0, False, False, {}), r"\(3,\), but its space"),
+        (lambda o: (o | {"arm": ["a", "b"]}, 0.0, False, False, {}), "'arm' holds what is no"),
+        (lambda o: (o | {"eye": np.zeros((31, 32, 3), np.uint8)}, 0.0, False, False, {}),
+         r"'eye' has shape \(31, 32, 3\)"),
+        (lambda o: 1 / 0, r"step raised ZeroDivisionError: division by zero \(test_own.py, line"),
+    ],
+)  # fmt: skip
+def test_what_is_no_step_is_told(step: Any, says: str) -> None:
+    env = adapt(Misgiving(step=step))
+    env.reset()
+    with pytest.raises(EnvironmentFailed, match=says):
+        env.step(np.zeros(2, np.float32))
+
+
+def test_what_is_usual_is_taken() -> None:
+    env = adapt(Misgiving(step=lambda o: (o, np.ones(1), np.bool_(True), 0, {"success": None})))
+    env.reset()
+    _, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
+    assert (reward, terminated, truncated, info) == (1.0, True, False, {})
+
+
+def test_an_old_reset_is_told() -> None:
+    given = Misgiving(reset=({"arm": np.zeros(2)},))
+    with pytest.raises(EnvironmentFailed, match="reset gave 1 values: it must return observation"):
+        adapt(given).reset()
+
+
+def test_no_motor_is_given_what_is_no_number() -> None:
+    given = Given(vector(2))
+    env = adapt(given)
+    env.reset()
+    with pytest.raises(NotFinite, match="the environment is not given it"):
+        env.step(np.array([0.0, np.nan], np.float32))
+    assert not hasattr(given, "acted")
+
+
+@pytest.mark.parametrize("shape", [(3, 20, 30), (9, 48, 48), (12, 20, 30)])
+def test_stacked_channels_that_come_first(shape: tuple[int, ...]) -> None:
+    env = adapt(Given(image(*shape)))
+    assert env.observation_space["image"].shape == (*shape[1:], shape[0])  # type: ignore[index]
+
+
+def test_many_channels_that_come_last() -> None:
+    assert adapt(Given(image(48, 64, 12))).observation_space["image"].shape == (48, 64, 12)  # type: ignore[index]
+
+
+def test_keys_are_strings_and_spaces_are_there() -> None:
+    with pytest.raises(MerlError, match="has the key 1: name it with a string"):
+        adapt(Given(spaces.Dict({1: vector(2)})))  # type: ignore[dict-item]
+
+    class Bare(gymnasium.Env[Any, Any]):
+        pass
+
+    with pytest.raises(MerlError, match="has no observation_space"):
+        adapt(Bare())
+
+
+def test_a_close_that_fails_stops_nothing() -> None:
+    class Stuck(Given):
+        def close(self) -> None:
+            raise OSError("the port is busy")
+
+    with pytest.warns(UserWarning, match="close raised OSError: the port is busy"):
+        adapt(Stuck(vector(2))).close()

@@ -223,9 +223,14 @@ def test_who_cannot_be_resumed_exactly_is_told(
     assert told == (which == "of_its_own")
 
 
-def test_an_error_that_cannot_be_sent_ends_the_run(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="LocalError: the gripper is gone"):
-        train(tmp_path / "run", "fails", "--num-envs", "2")
+def test_an_error_in_another_process_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", "fails", "--num-envs", "2") == 4
+    error = capsys.readouterr().err.strip()
+    assert "step raised LocalError: the gripper is gone (worker_envs.py, line" in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "run").exists()  # it had not begun
 
 
 def test_environments_step_while_the_learner_learns(

@@ -43,8 +43,8 @@ class AgentConfig:
     """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too, as DrQ-v2's target
     covers its trunk."""
     latent_dim: int = 128
-    """d, the length of the fused representation, split evenly over the modalities; 0 leaves the
-    fusion out: the encodings go to the heads as they are."""
+    """d, the length of the fused representation: an equal share for each modality, rounded down; 0
+    leaves the fusion out: the encodings go to the heads as they are."""
     fusion: FusionOwner = "decoupled"
     """Whose the fusion is (Figure 3a): one each for critic and actor, or one that both use, which
     the critic's loss moves, or both losses."""

@@ -16,6 +16,9 @@ from merl.networks.heads import Actor, GaussianActor, HeadSize, TwinCritic
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
 
+LEAST_SHARE = 3
+"""Numbers of the fused representation that a modality must have."""
+
 
 class Networks(nn.Module):
     """The parametric networks of Algorithm 1, without the targets.
@@ -78,7 +81,7 @@ def make_networks(
     """
     images, vectors = modalities(config, space)
     encoders = Encoders(
-        {key: _image_encoder(config, space[key], stack) for key in images},
+        {key: _image_encoder(config, key, space[key], stack) for key in images},
         {
             key: _vector_encoder(config, space[key])
             for key in (*vectors, *told_to_critic(config, space))
@@ -109,8 +112,11 @@ def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...]
     given = [k for k, s in space.items() if is_vector(s)]
     vectors = _keys("vectors", config.vectors, given, default=[k for k in given if k != "state"])
     if not images and not vectors:
-        if config.vectors == ():
-            hint = "it needs an image, a uint8 box (H, W, C), or take --agent proprio"
+        if config.vectors == () and config.images == ():
+            hint = "name some with --agent.images or --agent.vectors"
+        elif config.vectors == ():
+            others = "merl_state, ddpg or sac" if given == ["state"] else "proprio"
+            hint = f"it needs an image, a uint8 box (H, W, C), or take --agent {others}"
         elif "state" in given:
             hint = "name it with --agent.vectors state, or take --agent merl_state, ddpg or sac"
         else:
@@ -140,16 +146,17 @@ def told_to_critic(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
 
 
 def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
-    """What each modality has of d; with an informed critic, what the actor's have.
+    """What each modality has of d, rounded down; with an informed critic, what the actor's have.
 
     Raises:
-        MerlError: d cannot be split so.
+        MerlError: d is too small for so many, or for the groups of `simplex`.
     """
-    share, rest = divmod(config.latent_dim, len(senses))
-    if rest:
+    share = config.latent_dim // len(senses)
+    # Of a single number, or of two, LayerNorm leaves nothing but a sign.
+    if config.latent_dim and share < LEAST_SHARE:
         raise MerlError(
-            f"agent.latent-dim {config.latent_dim} does not split evenly over {len(senses)} "
-            f"modalities ({', '.join(senses)}): use a multiple of {len(senses)}"
+            f"agent.latent-dim {config.latent_dim} leaves {share} for each of {len(senses)} "
+            f"modalities ({', '.join(senses)}): use at least {LEAST_SHARE * len(senses)}"
         )
     if config.squash == "simplex" and share % SIMPLEX_GROUP:
         raise MerlError(
@@ -166,7 +173,9 @@ def _fusion(config: AgentConfig, features: Mapping[str, int], share: int) -> Fus
     return Fusion(features, share, config.fusion_norm, config.squash)
 
 
-def _image_encoder(config: AgentConfig, space: spaces.Space[Any], stack: int) -> ConvEncoder:
+def _image_encoder(
+    config: AgentConfig, key: str, space: spaces.Space[Any], stack: int
+) -> ConvEncoder:
     assert space.shape is not None
     height, width, channels = space.shape
     if config.shift_pad >= min(height, width):
@@ -174,7 +183,12 @@ def _image_encoder(config: AgentConfig, space: spaces.Space[Any], stack: int) ->
             f"agent.shift-pad {config.shift_pad} moves a picture of {height}x{width} pixels out of "
             f"sight: give at most {min(height, width) - 1}"
         )
-    return ConvEncoder(stack * channels, (height, width), config.conv_channels, config.conv_strides)
+    try:
+        return ConvEncoder(
+            stack * channels, (height, width), config.conv_channels, config.conv_strides
+        )
+    except MerlError as error:
+        raise MerlError(f"observation {key!r}: {error}") from None
 
 
 def _vector_encoder(config: AgentConfig, space: spaces.Space[Any]) -> VectorEncoder:
@@ -188,6 +202,8 @@ def _keys(
     if chosen is None:
         return tuple(given if default is None else default)
     for key in chosen:
+        if chosen.count(key) > 1:
+            raise MerlError(f"agent.{kind} names {key!r} twice: once is enough")
         if key not in given:
             there = f"gives {given}" if given else f"gives no {kind.split('-')[-1]}"
             raise MerlError(

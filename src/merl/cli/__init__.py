@@ -1,16 +1,18 @@
 """The command line.
 
 Exit codes (docs/running.md): 0 done; 2 bad input, told in one line; 3 a NaN or an infinity stopped
-the run; 129, 130, 138 and 143 stopped by SIGHUP, Ctrl-C, SIGUSR1 or SIGTERM, with a run that had
-begun saved and ready to go on; 141 nobody reads what is written.
+the run; 4 an environment failed, a run that had begun is saved; 129, 130, 138 and 143 stopped by
+SIGHUP, Ctrl-C, SIGUSR1 or SIGTERM, likewise saved; 141 nobody reads what is written.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
@@ -49,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code: int = getattr(import_module(module), name)(args[1:])
         return code
     except MerlError as error:
+        if os.environ.get("MERL_TRACEBACK"):
+            traceback.print_exc()
         print(f"merl: error: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt as stop:
@@ -60,7 +64,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     """A warning is for the user: one line, without the place in the source."""
-    print(f"merl: warning: {message}", file=sys.stderr)
+    text = " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(message)).split())  # some come in colours
+    if text:
+        print(f"merl: warning: {text}", file=sys.stderr)
 
 
 def _usage() -> str:

@@ -17,6 +17,7 @@ from merl.training import trainer
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
 from merl.training.console import ConsoleView
+from merl.training.environment import own_bounds
 from merl.training.parts import Parts
 from merl.training.resuming import taken_up
 from merl.training.run import Run
@@ -77,6 +78,8 @@ def _train(
         try:
             with console.status("building the scene and timing this machine"):
                 parts = stack.enter_context(Parts.prepare(config, new=resumed is None))
+            if resumed:
+                resumed[0].check_environment(parts.space, parts.action_space, own_bounds(parts.env))
             done = resumed[1].step if resumed and resumed[1] else 0
             console.print(_outlook(parts, what, done), highlight=False)
             with ConsoleView(console) as view:

@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from merl.cli.parsing import program
-from merl.core import MerlError, Observation
+from merl.core import MerlError
 from merl.report.figures import learning_curve
 from merl.report.references import Reference, references
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env
-from merl.training.evaluation import Evaluation, evaluate
+from merl.training.evaluation import Act, Evaluation, evaluate
 from merl.training.stretch import Outcome
 
 FLOORS = ("random actions", "no motion")
 """The references that need no skill."""
+ENOUGH = 5
+"""Episodes of an evaluation, below which its interval says nothing."""
 
 
 def summarize(outcome: Outcome, console: Console) -> None:
@@ -28,7 +29,9 @@ def summarize(outcome: Outcome, console: Console) -> None:
     if trained is None:
         return
     beside = references(run.config.task, run.config.env)
-    beside = beside or (random_reference(run.config),)
+    if not beside and run.config.eval.references:
+        with console.status(f"what {' and '.join(FLOORS)} are paid, to compare with"):
+            beside = _measured(run.config, console)
     console.print()
     console.print(comparison(run.config.task, trained, beside))
     lines = {reference.name: reference.returns.mean for reference in beside}
@@ -40,7 +43,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
     videos = sorted(run.videos.glob("*.mp4")) if run.videos.is_dir() else []
     if videos:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
-    console.print(_verdict(beside, trained), highlight=False)
+    console.print(_verdict(beside, trained, outcome.progress.updates), highlight=False)
     console.print(_way_on(outcome), highlight=False, soft_wrap=True)
     console.print(
         f"(its replay, {run.replay}, is only needed to go on, and may be deleted otherwise)",
@@ -50,21 +53,24 @@ def summarize(outcome: Outcome, console: Console) -> None:
     )
 
 
-def random_reference(config: TrainConfig, episodes: int = 20) -> Reference:
-    """Uniformly random actions from the evaluation's starts."""
+def floors(config: TrainConfig, episodes: int = 20) -> tuple[Reference, ...]:
+    """Random actions, and none (the middle of their range), from the evaluation's starts."""
     env = make_run_env(config)
     rng = np.random.default_rng(0)
     shape = env.action_space.shape
     assert shape is not None
-
-    def act(observation: Observation) -> NDArray[np.float32]:
-        return rng.uniform(-1.0, 1.0, shape).astype(np.float32)
-
+    policies: tuple[Act, Act] = (
+        lambda _: rng.uniform(-1.0, 1.0, shape).astype(np.float32),
+        lambda _: np.zeros(shape, np.float32),
+    )
     try:
-        result = evaluate(act, env, episodes)
+        results = [evaluate(act, env, episodes) for act in policies]
     finally:
         env.close()
-    return Reference(FLOORS[0], result.returns, result.success_end, f"{episodes} episodes")
+    return tuple(
+        Reference(name, result.returns, result.success_end, f"{episodes} episodes")
+        for name, result in zip(FLOORS, results, strict=True)
+    )
 
 
 def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> Table:
@@ -84,18 +90,37 @@ def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> T
     return table
 
 
-def _verdict(beside: Sequence[Reference], trained: Evaluation) -> str:
+def _measured(config: TrainConfig, console: Console) -> tuple[Reference, ...]:
+    """What can be measured of the references that need no skill; the run is over in any case."""
+    try:
+        return floors(config)
+    except MerlError as error:
+        console.print(f"there is nothing to compare with: {error}", highlight=False)
+        return ()
+
+
+def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> str:
     """Whether anything was learnt, as far as the intervals allow to say.
 
     Doing nothing can be paid more than acting at random.
     """
-    floor = max((row for row in beside if row.name in FLOORS), key=lambda row: row.returns.high)
-    if trained.returns.low > floor.returns.high:
-        return f"It has begun to learn: its return lies clearly above that of {floor.name}."
-    return (
-        "It is too early to say that it has learnt: its return is not clearly above that of "
-        f"{floor.name}."
-    )
+    if updates == 0:
+        return "Nothing was learnt: there was no update."
+    lower = [row for row in beside if row.name in FLOORS]
+    if not lower:
+        return "Whether it has learnt cannot be said: there is nothing to compare with."
+    floor = max(lower, key=lambda row: row.returns.high)
+    if trained.returns.low <= floor.returns.high:
+        return (
+            "It is too early to say that it has learnt: its return is not clearly above that of "
+            f"{floor.name}."
+        )
+    if len(trained.episodes) < ENOUGH:
+        return (
+            f"Its return lies above that of {floor.name}, but {len(trained.episodes)} episodes are "
+            "too few to say that it has learnt: evaluate more (--eval.episodes)."
+        )
+    return f"It has begun to learn: its return lies clearly above that of {floor.name}."
 
 
 def _way_on(outcome: Outcome) -> str:

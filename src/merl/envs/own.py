@@ -12,15 +12,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.envs.registration import registry
-from numpy.typing import NDArray
 
-from merl.core import MerlError, is_image, is_vector, meant
+from merl.core import MerlError, meant
+from merl.envs.adapted import adapt, failing, in_one_line
 from merl.envs.registration import ENV_IDS
-
-MOST_CHANNELS = 4
-"""Of an image; where the first axis has so few and the last more, channels come first."""
 
 
 def make_own(task: str, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
@@ -59,139 +55,10 @@ def module_folder(task: str) -> Path | None:
     return path.parent.parent if path.name == "__init__.py" else path.parent
 
 
-def search_also(folder: Path) -> None:
-    """Have Python look for modules in this folder too, after all others."""
-    if str(folder) not in sys.path and folder.is_dir():
-        sys.path.append(str(folder))
-
-
-def adapt(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-    """An environment in the form that agents take.
-
-    A plain box of numbers becomes `state`, a plain picture `image`; of a `Dict` the images (uint8
-    boxes) and vectors (boxes of one axis) stay, with a warning for the rest. A box of finite
-    actions is rescaled to [-1, 1]. `info["is_success"]` counts as `success`.
-
-    Raises:
-        MerlError: the actions are not a box of finite bounds, or nothing can be sensed.
-    """
-    actions = env.action_space
-    if (
-        not isinstance(actions, spaces.Box)
-        or len(actions.shape) != 1
-        or not np.issubdtype(actions.dtype, np.floating)
-    ):
-        raise MerlError(
-            f"the environment's actions are {actions}: an agent here gives a box of real numbers "
-            "(n,)"
-        )
-    if not np.isfinite([actions.low, actions.high]).all() or (actions.low > actions.high).any():
-        raise MerlError(
-            f"the environment's actions are {actions}: give them finite bounds, which are scaled "
-            "to [-1, 1]"
-        )
-    return Adapted(env)
-
-
-class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Observations as a `Dict` of images and vectors, actions in [-1, 1].
-
-    Args:
-        env: whose observations are a box, or a `Dict` of boxes, and whose actions are a finite box.
-    """
-
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        super().__init__(env)
-        given = env.observation_space
-        self._plain = None if isinstance(given, spaces.Dict) else _plain_key(given)
-        parts = given.spaces if isinstance(given, spaces.Dict) else {str(self._plain): given}
-        taken: dict[str, spaces.Space[Any]] = {}
-        for key, part in parts.items():
-            space = _taken(part)
-            if space is None:
-                warnings.warn(
-                    f"observation {key!r} is not used: {part} is neither an image (uint8, "
-                    "H x W x C) nor a vector (n numbers)",
-                    stacklevel=2,
-                )
-            else:
-                taken[key] = space
-        if not taken:
-            raise MerlError(
-                f"the environment's observation {given} has neither an image (a uint8 box, "
-                "H x W x C) nor a vector (a box of n numbers): wrap it so that it has"
-            )
-        self._spaces = taken
-        self.observation_space = spaces.Dict(taken)
-        actions = env.action_space
-        assert isinstance(actions, spaces.Box)
-        self._low, self._high = actions.low.astype(np.float64), actions.high.astype(np.float64)
-        self._dtype = actions.dtype
-        self.action_space = spaces.Box(-1.0, 1.0, actions.shape, np.float32)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; see `gymnasium.Env.reset`."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self._adapted(observation), info
-
-    def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], Any, bool, bool, Any]:
-        """Take an action in [-1, 1]; see `gymnasium.Env.step`."""
-        observation, reward, terminated, truncated, info = self.env.step(self._scaled(action))
-        if "is_success" in info and "success" not in info:
-            info = {**info, "success": info["is_success"]}
-        over = bool(terminated), bool(truncated)
-        return self._adapted(observation), float(reward), *over, info
-
-    def _scaled(self, action: NDArray[np.float32]) -> NDArray[Any]:
-        """From [-1, 1] to the environment's own bounds, never beyond them."""
-        share = (np.asarray(action, np.float64) + 1.0) / 2.0
-        wanted = self._low + share * (self._high - self._low)
-        return wanted.clip(self._low, self._high).astype(self._dtype)
-
-    def _adapted(self, observation: Any) -> dict[str, Any]:
-        whole = observation if self._plain is None else {self._plain: observation}
-        adapted = {}
-        for key, space in self._spaces.items():
-            if key not in whole:
-                raise MerlError(f"the environment's observation lacks {key!r}, which its space has")
-            adapted[key] = _part(key, space, whole[key])
-        return adapted
-
-
-def _part(key: str, space: spaces.Space[Any], value: Any) -> NDArray[Any]:
-    """One modality as its space has it."""
-    array = np.asarray(value)
-    if is_image(space):
-        if array.dtype != np.uint8:
-            raise MerlError(
-                f"observation {key!r} is of {array.dtype}, but its space says uint8: give pixels "
-                "from 0 to 255"
-            )
-        if array.shape != space.shape:
-            array = array[..., None] if array.ndim == 2 else np.moveaxis(array, 0, -1)
-    return array.astype(space.dtype, copy=False)
-
-
-def _plain_key(space: spaces.Space[Any]) -> str:
-    """The key of an observation that has none."""
-    return "image" if space.dtype == np.uint8 and len(space.shape or ()) > 1 else "state"
-
-
-def _taken(space: spaces.Space[Any]) -> spaces.Box | None:
-    """The space as agents know it; None if it is neither image nor vector."""
-    if not isinstance(space, spaces.Box):
-        return None
-    if is_image(space) or (space.dtype == np.uint8 and len(space.shape) == 2):
-        shape = (*space.shape, 1) if len(space.shape) == 2 else space.shape
-        if shape[0] <= MOST_CHANNELS < shape[2]:
-            shape = (*shape[1:], shape[0])
-        return spaces.Box(0, 255, shape, np.uint8)
-    if is_vector(space) or len(space.shape) == 1:
-        low, high = space.low.astype(np.float32), space.high.astype(np.float32)
-        return spaces.Box(low, high, space.shape, np.float32)
-    return None
+def search_first(folder: Path) -> None:
+    """Have Python look for modules in this folder first, and then in the one where we are."""
+    if folder.is_dir():
+        sys.path[:0] = [str(folder), str(Path.cwd())]
 
 
 def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
@@ -232,12 +99,16 @@ def _imported(task: str, module: str) -> ModuleType:
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
+        if not f"{module}.".startswith(f"{error.name}."):
+            raise MerlError(
+                f"task {task!r}: {module!r} imports {error.name!r}, which is not installed here"
+            ) from None
         raise MerlError(
             f"task {task!r}: {error}: call merl where it lies, or name its folder in PYTHONPATH"
         ) from None
     except Exception as error:
         raise MerlError(
-            f"task {task!r}: importing {module!r} failed: {type(error).__name__}: {_line(error)}"
+            f"task {task!r}: importing {module!r} failed: {in_one_line(error)}"
         ) from error
 
 
@@ -250,9 +121,15 @@ def _called(task: str, make: Any, render_mode: str | None) -> Any:
     except (TypeError, ValueError) as error:
         raise MerlError(
             f"task {task!r}: a function is needed that makes an environment and takes no "
-            f"arguments, or render_mode alone ({_line(error)})"
+            f"arguments, or render_mode alone ({error})"
         ) from None
-    return make(**given)
+    try:
+        with failing(f"function {task.partition(':')[2]}"):
+            return make(**given)
+    except MerlError:
+        if render_mode is None:
+            raise
+        return _called(task, make, None)  # it may not know this way to render
 
 
 def _renders(env: gymnasium.Env[Any, Any]) -> bool:
@@ -263,12 +140,12 @@ def _renders(env: gymnasium.Env[Any, Any]) -> bool:
         env.reset(seed=0)
         picture: Any = env.render()
     except Exception as error:  # whatever a display or a driver may raise
-        warnings.warn(f"the environment cannot be filmed: {_line(error)}", stacklevel=2)
+        warnings.warn(f"the environment cannot be filmed: {in_one_line(error)}", stacklevel=1)
         return False
     usable = isinstance(picture, np.ndarray) and picture.dtype == np.uint8
     if not usable or picture.ndim != 3 or picture.shape[2] != 3:
         warnings.warn(
-            "the environment cannot be filmed: it does not render uint8 (H, W, 3)", stacklevel=2
+            "the environment cannot be filmed: it does not render uint8 (H, W, 3)", stacklevel=1
         )
         return False
     return True
@@ -282,9 +159,10 @@ def _by_id(env_id: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
             return _by_id(env_id, None)
     try:
         return gymnasium.make(env_id)
-    except (gymnasium.error.Error, ImportError, TypeError) as error:
-        raise MerlError(f"task {env_id!r} cannot be made: {_line(error)}") from None
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    except ImportError as error:
+        raise MerlError(
+            f"task {env_id!r} cannot be made: {error}: install what it needs; Gymnasium's own come "
+            'with its extras, as pip install "gymnasium[mujoco]"'
+        ) from None
+    except Exception as error:
+        raise MerlError(f"task {env_id!r} cannot be made: {in_one_line(error)}") from error

@@ -40,9 +40,13 @@ class ConvEncoder(nn.Module):
             layers += [nn.Conv2d(source, channels, kernel_size=3, stride=stride), nn.ReLU()]
             height, width = ((side - 3) // stride + 1 for side in (height, width))
         if height < 1 or width < 1:
+            least = 1
+            for stride in reversed(strides):
+                least = (least - 1) * stride + 3
             raise MerlError(
                 f"an image of {image_size[0]}x{image_size[1]} pixels is too small for strides "
-                f"{tuple(strides)}: use a larger image or smaller strides"
+                f"{tuple(strides)}, which need {least} pixels a side: use a larger one, or smaller "
+                "--agent.conv-strides"
             )
         self.features = channels * height * width
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -7,6 +7,6 @@ from torch import nn
 
 def module_name(key: str) -> str:
     """The key itself, unless torch would take it for something else (`arm.joints`, `type`)."""
-    if key.isidentifier() and not hasattr(nn.ModuleDict, key):
+    if key.isidentifier() and not hasattr(nn.ModuleDict(), key):
         return key
     return f"key_{key.encode().hex()}"

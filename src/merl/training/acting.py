@@ -22,7 +22,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.async_vector_env import AsyncState
 from numpy.typing import NDArray
 
-from merl.core import EnvironmentsLost, Observation
+from merl.core import EnvironmentsLost, MerlError, Observation
 from merl.training.config import TrainConfig
 from merl.training.environment import environment_state, make_run_env, set_environment_state
 
@@ -237,6 +237,9 @@ class Workers:
             self._lost = "did not answer in time"
         except (EOFError, ConnectionError):
             self._lost = "died"
+        except MerlError:
+            self._lost = "failed"  # its pipe is closed: nothing more can be asked of it
+            raise
         if self._lost is not None:
             raise Lost(self._lost)
 
@@ -255,6 +258,8 @@ class Workers:
                 START_SECONDS, lambda: set(multiprocessing.active_children()) - {*others}
             ),
         ):
+            # What a worker raises is raised here; Gymnasium would print it, too.
+            gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
             return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
 
 

@@ -34,6 +34,9 @@ class EvaluationConfig:
     """Episodes of each evaluation."""
     video: Literal["each", "last", "none"] = "each"
     """Which evaluations to film (their first episode)."""
+    references: bool = True
+    """At the end, and where it is not known, take 20 episodes each of random actions and of none to
+    compare with; not with an arm that must not flail (--eval.no-references)."""
 
     def __post_init__(self) -> None:
         for name in ("every", "episodes"):

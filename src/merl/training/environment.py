@@ -64,6 +64,14 @@ def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[space
     return spaces.Dict({key: space[key] for key in keys}), env.action_space
 
 
+def own_bounds(env: gymnasium.Env[Any, Any]) -> tuple[list[float], list[float]] | None:
+    """The bounds of the environment's own actions, lower and upper, where they were rescaled."""
+    bounds: tuple[list[float], list[float]] | None = None
+    if env.has_wrapper_attr("bounds"):
+        bounds = env.get_wrapper_attr("bounds")
+    return bounds
+
+
 def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
     """Where the environment's random numbers stand, as plain types; None if it does not tell.
 

@@ -16,17 +16,21 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.agents import make_agent
-from merl.core import Agent, MerlError, Observation, is_image
+from merl.core import Agent, MerlError, NotFinite, Observation, is_image
 from merl.statistics import Interval, bootstrap_interval, wilson_interval
 from merl.training.checkpoint import Checkpoint, load_networks
 from merl.training.config import TrainConfig
-from merl.training.environment import make_run_env
+from merl.training.environment import make_run_env, own_bounds, run_spaces
+from merl.training.guards import check_moment
 from merl.training.rollout import Episode, FrameStack
 from merl.training.run import Run
 from merl.training.video import VideoWriter
 
 EVALUATION_SEED = 1_000_000
 """Episode i of every evaluation starts from `env.reset(seed=EVALUATION_SEED + i)`."""
+
+LONGEST = 100_000
+"""Steps of an episode of an evaluation, lest one that never ends be waited for."""
 
 Act = Callable[[Observation], NDArray[np.float32]]
 
@@ -48,8 +52,9 @@ class Policy:
         space: spaces.Dict,
         device: torch.device,
         step: int = 0,
+        run: Run | None = None,
     ) -> None:
-        self.config, self.step = config, step
+        self.config, self.step, self._run = config, step, run
         self._agent = agent
         self._space = {key: space[key] for key in agent.senses}
         images = tuple(key for key in agent.senses if is_image(space[key]))
@@ -70,7 +75,9 @@ class Policy:
             float32 (A,), in [-1, 1].
 
         Raises:
-            MerlError: a key is missing or has another shape than the agent was trained with.
+            MerlError: a key is missing or has another shape or type than the agent was trained
+                with.
+            NotFinite: a number of it is none.
         """
         sensed = {key: self._checked(key, observation) for key in self._space}
         if self._fresh:
@@ -83,7 +90,11 @@ class Policy:
         return result
 
     def make_env(self, **changes: Any) -> gymnasium.Env[Any, Any]:
-        """The environment that the agent was trained in, with fields of `EnvConfig` changed."""
+        """The environment that the agent was trained in, with fields of `EnvConfig` changed.
+
+        Raises:
+            MerlError: it cannot be made, or is no longer what the agent was trained in.
+        """
         renderer = changes.get("renderer", self.config.env.renderer)
         if renderer != self.config.env.renderer and not self.config.own_env:
             warnings.warn(
@@ -91,7 +102,14 @@ class Policy:
                 f"{renderer!r} now: these pictures differ, and it may do worse",
                 stacklevel=2,
             )
-        return make_run_env(self.config, **changes)
+        env = make_run_env(self.config, **changes)
+        if self._run is not None and self.config.own_env:
+            try:
+                self._run.check_environment(*run_spaces(self.config, env), own_bounds(env))
+            except BaseException:
+                env.close()
+                raise
+        return env
 
     def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
         space = self._space[key]
@@ -102,7 +120,17 @@ class Policy:
         value = np.asarray(observation[key])
         if value.shape != space.shape:
             raise MerlError(f"observation {key!r} has shape {value.shape}: {space.shape} is needed")
-        return value.astype(space.dtype, copy=False)
+        if is_image(space) and value.dtype != np.uint8:
+            raise MerlError(
+                f"observation {key!r} is of {value.dtype}: pixels from 0 to 255, uint8, are needed"
+            )
+        try:
+            value = value.astype(space.dtype, copy=False)
+        except (TypeError, ValueError):
+            raise MerlError(f"observation {key!r} holds what is no number") from None
+        if not np.isfinite(value).all():
+            raise NotFinite(f"observation {key!r} holds a NaN or an infinity: {value}")
+        return value
 
 
 @dataclass(frozen=True)
@@ -212,8 +240,14 @@ def _run_episode(
             film = stack.enter_context(VideoWriter(video, fps=fps))
         while not over:
             observation, reward, terminated, truncated, info = env.step(act(observation))
+            check_moment(observation, float(reward), episode.length + 1, "of an evaluation")
             episode.add(float(reward), info)
             over = terminated or truncated
+            if episode.length >= LONGEST and not over:
+                raise MerlError(
+                    f"an episode of the evaluation is not over after {LONGEST:,} steps: give the "
+                    "environment a limit, gymnasium.wrappers.TimeLimit"
+                )
             if film is not None:
                 film.add(np.asarray(env.render()), _caption(episode))
             tick(index)
@@ -230,7 +264,7 @@ def _caption(episode: Episode) -> dict[str, str | float | bool | int]:
     return caption
 
 
-def load_policy(run: str | Path, *, checkpoint: str = "latest") -> Policy:
+def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:
     """The policy that a run has learnt.
 
     Args:
@@ -241,7 +275,7 @@ def load_policy(run: str | Path, *, checkpoint: str = "latest") -> Policy:
         MerlError: there is no run, or no whole checkpoint in it.
     """
     opened = Run.open(Path(run))
-    saved = Checkpoint.find(opened.checkpoints, checkpoint)
+    saved = Checkpoint.find(opened.checkpoints, str(checkpoint))
     config, device = opened.config, torch.device("cpu")
     if config.device == "cuda" and torch.cuda.is_available():
         device = torch.device("cuda")
@@ -255,4 +289,4 @@ def load_policy(run: str | Path, *, checkpoint: str = "latest") -> Policy:
         device=device,
     )
     load_networks(agent.networks, saved)
-    return Policy(agent, config, observation_space, device, step=saved.step)
+    return Policy(agent, config, observation_space, device, step=saved.step, run=opened)

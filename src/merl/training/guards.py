@@ -13,27 +13,27 @@ from merl.core import NotFinite, Observation
 _NEVER = torch.iinfo(torch.int64).max
 
 
-def check_moment(observation: Observation, reward: float, step: int) -> None:
+def check_moment(observation: Observation, reward: float, step: int, where: str = "") -> None:
     """What an environment gave, before it enters the replay.
 
     Args:
         observation: images need no look, bytes are always numbers.
         reward: what led there paid.
         step: environment steps so far.
+        where: what these are the steps of, where not of the run.
 
     Raises:
         NotFinite: naming the value and the step.
     """
+    at = f"at step {step:,} {where}".rstrip()
     if not abs(reward) <= np.finfo(np.float32).max:  # beyond it, the replay would keep infinity
-        raise NotFinite(f"the environment's reward is {reward} at step {step:,}")
+        raise NotFinite(f"the environment's reward is {reward} {at}")
     for key, value in observation.items():
         value = np.asarray(value)
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             index = np.flatnonzero(~np.isfinite(value))[0]
-            raise NotFinite(
-                f"the environment's observation {key!r} is {value.flat[index]} in place {index} "
-                f"at step {step:,}"
-            )
+            place = f"in place {index} {at}"
+            raise NotFinite(f"the environment's observation {key!r} is {value.flat[index]} {place}")
 
 
 def check_weights(groups: Mapping[str, Mapping[str, Tensor]]) -> None:

@@ -22,6 +22,7 @@ HARMLESS = (
     "eval.every",
     "eval.episodes",
     "eval.video",
+    "eval.references",
     "agent.precision",
 )
 """Fields that may change: they decide how long, how fast and how closely watched, not what."""

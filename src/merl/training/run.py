@@ -36,13 +36,15 @@ from gymnasium import spaces
 import merl
 from merl.agents import AGENTS
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
-from merl.envs.own import module_folder, search_also
+from merl.envs.own import module_folder, search_first
 from merl.training.config import TrainConfig
 
 LOCK_FILE = "lock"
 FORMAT = 1
 PACKAGES = ("torch", "numpy", "gymnasium", "dm_control", "mujoco", "mujoco-warp", "warp-lang")
 T = TypeVar("T")
+Bounds = tuple[list[float], list[float]]
+"""Of an environment's own actions: lower, upper."""
 
 
 @dataclass(frozen=True)
@@ -54,16 +56,25 @@ class Run:
 
     @classmethod
     def create(
-        cls, config: TrainConfig, observation_space: spaces.Dict, action_space: spaces.Box
+        cls,
+        config: TrainConfig,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        bounds: Bounds | None = None,
     ) -> Run:
         """Make the folder and record what is run.
+
+        Args:
+            config: of the run.
+            observation_space: what the agent consumes.
+            action_space: what it does, in [-1, 1].
+            bounds: of the environment's own actions, where they were rescaled.
 
         Raises:
             MerlError: the folder exists, or cannot be made.
         """
         path = run_path(config)
         refuse_existing(path)
-        folder = module_folder(config.task)
         record = {
             "format": FORMAT,
             "merl": merl.__version__,
@@ -73,9 +84,9 @@ class Run:
             "setting": config.setting,
             "seed": config.seed,
             "config": to_plain(config),
-            "module_folder": None if folder is None else str(folder),
+            "module_folder": _module_folder(config.task),
             "observation_space": {key: _describe(s) for key, s in observation_space.items()},
-            "action_space": _describe(action_space),
+            "action_space": _describe(action_space) | {"own_bounds": bounds},
             "versions": package_versions(),
             "commit": _commit(),
             "machine": machine(),
@@ -109,13 +120,14 @@ class Run:
             _last_machine(record)
             folder = record.get("module_folder")
             if folder is not None:  # so that the run works from wherever it is called
-                search_also(Path(folder))
+                search_first(Path(folder))
         return cls(path, dataclasses.replace(config, run_dir=path))
 
     def record_resumption(self, step: int) -> None:
         """Note that the run goes on from `step`, with what; from now on its config is this one."""
         record = _read(self.path)
         record["config"] = to_plain(self.config)
+        record["module_folder"] = _module_folder(self.config.task)
         record.setdefault("resumed", []).append(
             {
                 "step": step,
@@ -126,6 +138,37 @@ class Run:
             }
         )
         self._write(record)
+
+    def check_environment(
+        self, observation_space: spaces.Dict, action_space: spaces.Box, bounds: Bounds | None
+    ) -> None:
+        """That an environment is what the run was trained in; arguments as for `create`.
+
+        Raises:
+            MerlError: naming what differs.
+        """
+        record = _read(self.path)
+        before = {f"observation {k!r}": _told(s) for k, s in record["observation_space"].items()}
+        now = {f"observation {k!r}": _told(_describe(s)) for k, s in observation_space.items()}
+        before["action"], now["action"] = (
+            _told(record["action_space"]),
+            _told(_describe(action_space)),
+        )
+        own = record["action_space"].get("own_bounds")
+        if own is not None and bounds is not None:
+            before["the actions' bounds"], now["the actions' bounds"] = (
+                "low {}, high {}".format(*each) for each in (own, bounds)
+            )
+        differs = [
+            f"{name} was {before.get(name, 'not there')} and is {now.get(name, 'not there')}"
+            for name in before | now
+            if before.get(name) != now.get(name)
+        ]
+        if differs:
+            raise MerlError(
+                f"the environment is not what {self.path} was trained in: {'; '.join(differs)}: "
+                "make it as it was, or begin another run"
+            )
 
     def has_moved(self) -> bool:
         """Whether it was trained last on another machine than this one."""
@@ -376,6 +419,15 @@ def _recorded_spaces(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box
         key: _box(described) for key, described in record["observation_space"].items()
     }
     return spaces.Dict(observation), _box(record["action_space"])
+
+
+def _module_folder(task: str) -> str | None:
+    folder = module_folder(task)
+    return None if folder is None else str(folder)
+
+
+def _told(described: Mapping[str, Any]) -> str:
+    return f"{described['dtype']} {tuple(described['shape'])}"
 
 
 def _describe(space: spaces.Space[Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from merl.core import EnvironmentsLost, is_image
+from merl.core import EnvironmentFailed, EnvironmentsLost, is_image
 from merl.replay import Lanes
 from merl.training import checkpoint
 from merl.training.acting import Environments, Lost
@@ -22,6 +22,9 @@ from merl.training.rollout import FrameStack, mean_metrics
 from merl.training.run import Run, to_plain
 from merl.training.signals import Interrupt
 from merl.training.updating import make_update
+
+LONG = 10_000
+"""Steps of an episode, from which on one wonders whether it will end."""
 
 
 class View(Protocol):
@@ -88,11 +91,29 @@ class Stretch:
         self.clock, self.averages, self.guard = Clock(), Averages(), LossGuard()
         self.evaluation: Evaluation | None = None
         self.losses = 0
+        self._ended: int | None = parts.progress.step
         self._states: list[dict[str, Any] | None] = [None] * environments.count
         self._interval = Interval(self.config.save_every)
 
     def train(self) -> Outcome:
-        """Drive the loop; between its steps log, evaluate, save, and see whether to stop."""
+        """Drive the loop to its end; where the environment fails, save before that is told.
+
+        Raises:
+            EnvironmentFailed: the user's environment did; the run can go on.
+        """
+        try:
+            return self._drive()
+        except EnvironmentFailed as failure:
+            step = self.parts.progress.step
+            if step == 0 or not self._save():
+                raise
+            raise EnvironmentFailed(
+                f"{failure}; the run is saved at step {step:,}: mend it, and go on with "
+                f"`merl resume {self.run.path}`"
+            ) from failure
+
+    def _drive(self) -> Outcome:
+        """Between the loop's steps log, evaluate, save, and see whether to stop."""
         parts, progress = self.parts, self.parts.progress
         images = tuple(key for key in parts.space if is_image(parts.space[key]))
         stacks = [
@@ -119,6 +140,7 @@ class Stretch:
                 )
             self.guard.watch(moment.learning, moment.step)
             self.averages.add(moment.learning)
+            self._watch_for_an_end(moment)
             if moment.lost and not self._is_to_stop():
                 self._lost(moment.lost)
             self.view.moment(moment, self._log(moment) if moment.episodes else {})
@@ -148,6 +170,17 @@ class Stretch:
             ) from None
         self.clock = Clock(state["seconds"], state["cpu_seconds"])
         self.metrics.trim(parts.progress.step)
+
+    def _watch_for_an_end(self, moment: Moment) -> None:
+        """Rows and checkpoints wait for the end of an episode: tell, once, if none comes."""
+        if moment.episodes:
+            self._ended = moment.step
+        elif self._ended is not None and moment.step - self._ended > LONG:
+            self._ended = None
+            self.view.warn(
+                f"no episode has ended in {LONG:,} steps, and nothing is logged or saved until one "
+                "does: an environment that goes on for ever needs gymnasium.wrappers.TimeLimit"
+            )
 
     def _lost(self, what: str) -> None:
         """An environment's process was lost: they are started again, if not too often.

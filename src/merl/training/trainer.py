@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from merl.replay import Lanes
 from merl.training.acting import Here, Workers
 from merl.training.checkpoint import Checkpoint
+from merl.training.environment import own_bounds
 from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
 from merl.training.run import Run
@@ -18,7 +19,7 @@ from merl.training.stretch import Outcome, Stretch, View
 
 def start(parts: Parts, view: View) -> Outcome:
     """Begin a new run; if it fails before its first step, its folder is removed again."""
-    run = Run.create(parts.config, parts.space, parts.action_space)
+    run = Run.create(parts.config, parts.space, parts.action_space, own_bounds(parts.env))
     try:
         with run.lock():
             return _train(parts, run, None, view)

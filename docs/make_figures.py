@@ -10,7 +10,7 @@ from measure_references import EASIER
 
 from merl.envs import EnvConfig
 from merl.experiments.small_tasks import SPLIT, optimum, returns_of
-from merl.report.curves import Curve
+from merl.report.curves import Curve, curve
 from merl.report.figures import learning_curves, reward_terms
 from merl.report.references import references
 from merl.statistics import bootstrap_interval, wilson_interval
@@ -18,6 +18,8 @@ from merl.statistics import bootstrap_interval, wilson_interval
 DOCS = Path(__file__).parent
 DATA, IMAGES = DOCS / "data", DOCS / "images"
 AGENTS = DATA / "agents"
+MOST = {"state": 100_000, "laptop": 40_000}
+"""Steps that the agents are compared over."""
 SENSES = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", "proprio")}
 
 
@@ -97,17 +99,26 @@ def agents() -> None:
         form = EnvConfig() if task == "reach_duplo" else EnvConfig(**EASIER)
         known = {row.name: row.returns.mean for row in references(task, form)}
         for preset, names in SENSES.items():
-            runs = {
-                f"{agent}, matched": sorted(AGENTS.glob(f"{task}-{agent}-{preset}-matched-s*.csv"))
-                for agent in names
-            }
+            runs = {name: seeds(task, name, preset) for name in names}
             if all(runs.values()):
+                labels = {f"{agent}, matched": files for agent, files in runs.items()}
                 learning_curves(
-                    runs,
+                    labels,
                     IMAGES / f"agents-{task}-{preset}.png",
                     references=known,
                     title=f"{task}, preset {preset}",
                 )
+
+
+def seeds(task: str, agent: str, preset: str) -> list[Curve]:
+    """The evaluations of an agent's runs, as far as those of the others go (`MOST`)."""
+    files = sorted(AGENTS.glob(f"{task}-{agent}-{preset}-matched-s*.csv"))
+    if (agent, preset) == ("merl", "laptop"):
+        files = sorted(DATA.glob("laptop-seed?.csv"))  # these runs are merl's on reach_duplo
+    elif not files and agent == "merl_state":
+        files = [DATA / f"state-{task}-easier-seed0.csv"]
+    whole = [curve(file, "eval/return") for file in files]
+    return [Curve(*(part[one.steps <= MOST[preset]] for part in one)) for one in whole]
 
 
 def small_tasks() -> None:

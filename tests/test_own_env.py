@@ -115,6 +115,23 @@ def test_held_actions_are_filmed_resumed_and_told_apart(tmp_path: Path) -> None:
     assert main(["evaluate", str(run), "--renderer", "gl"]) == 2
 
 
+@pytest.mark.parametrize(("long", "told"), [(10, True), (30, False)])
+def test_who_waits_for_the_end_of_an_episode_is_told(
+    long: int,
+    told: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Those of the dot have 20 steps."""
+    monkeypatch.setattr("merl.training.stretch.LONG", long)
+    short = [*SHORT, "--agent", "proprio", "--eval.no-references", "--run-dir", str(tmp_path / "r")]
+    assert main(["train", "merl.envs.dot:whole", *short]) == 0
+    assert main(["resume", str(tmp_path / "r"), "--steps", "280"]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert ("no episode has ended in" in out) == told
+
+
 @pytest.mark.parametrize("agent", ["ddpg", "sac", "merl_state"])
 def test_pendulum(agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"

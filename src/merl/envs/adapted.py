@@ -59,7 +59,7 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         env: whose observations are a box, or a `Dict` of boxes, and whose actions are a finite box.
 
     Attributes:
-        bounds: the environment's own bounds of each action, lower and upper.
+        own_bounds: the environment's bounds of each action, lower and upper.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -94,7 +94,7 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         assert isinstance(actions, spaces.Box)
         self._low, self._high = actions.low.astype(np.float64), actions.high.astype(np.float64)
         self._dtype = actions.dtype
-        self.bounds = self._low.tolist(), self._high.tolist()
+        self.own_bounds = self._low.tolist(), self._high.tolist()
         self.action_space = spaces.Box(-1.0, 1.0, actions.shape, np.float32)
 
     def reset(

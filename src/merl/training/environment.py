@@ -67,8 +67,8 @@ def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[space
 def own_bounds(env: gymnasium.Env[Any, Any]) -> tuple[list[float], list[float]] | None:
     """The bounds of the environment's own actions, lower and upper, where they were rescaled."""
     bounds: tuple[list[float], list[float]] | None = None
-    if env.has_wrapper_attr("bounds"):
-        bounds = env.get_wrapper_attr("bounds")
+    if env.has_wrapper_attr("own_bounds"):
+        bounds = env.get_wrapper_attr("own_bounds")
     return bounds
 
 

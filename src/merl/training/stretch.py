@@ -91,7 +91,7 @@ class Stretch:
         self.clock, self.averages, self.guard = Clock(), Averages(), LossGuard()
         self.evaluation: Evaluation | None = None
         self.losses = 0
-        self._ended: int | None = parts.progress.step
+        self._ended: int | None = None  # the last episode's step, until it is long ago
         self._states: list[dict[str, Any] | None] = [None] * environments.count
         self._interval = Interval(self.config.save_every)
 
@@ -130,6 +130,7 @@ class Stretch:
         if progress.step == 0:
             self._save()  # from here on there is something to go on from
         self.clock.mark(progress)
+        self._ended = progress.step
         for count, moment in enumerate(
             train(stage, parts.agent, update, progress, parts.randomness, self.config)
         ):

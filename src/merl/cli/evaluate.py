@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 import tyro
 from rich.console import Console
 
@@ -47,6 +49,8 @@ def evaluate(args: list[str]) -> int:
     options = parse(EvaluateOptions, "merl evaluate", args)
     console = Console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
+    # As the run had it: several threads wait for each other where the machine does other work, too.
+    torch.set_num_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))
     changes: dict[str, Any] = {} if options.renderer is None else {"renderer": options.renderer}
     if options.video is not None:
         size = max(policy.config.env.render_size, MIN_SIDE)

@@ -67,18 +67,25 @@ def test_all_but_the_state_is_sensed() -> None:
     assert modalities(MERLConfig(images=()), SPACE) == ((), ("proprio",))
 
 
+def test_what_does_not_split_evenly_is_rounded_down() -> None:
+    networks = make(MERLConfig(latent_dim=127)).networks
+    assert networks.critic_fusion.latent_dim == 126
+    assert {p.out_features for p in networks.critic_fusion.projections.values()} == {63}
+
+
 @pytest.mark.parametrize(
     ("config", "says"),
     [
         ({"images": ("camera",)}, "names 'camera'"),
         ({"images": ("proprio",)}, "names 'proprio'"),
         ({"vectors": ("joints",)}, "names 'joints'"),
-        ({"images": (), "vectors": ()}, "it needs an image"),
+        ({"images": (), "vectors": ()}, "name some with --agent.images or --agent.vectors"),
+        ({"vectors": ("proprio", "proprio")}, "names 'proprio' twice"),
         ({"images": (), "vectors": None, "critic_vectors": ("image",)}, "names 'image'"),
-        ({"latent_dim": 127}, "127 does not split evenly over 2 modalities"),
+        ({"latent_dim": 5}, "5 leaves 2 for each of 2 modalities"),
         (
-            {"latent_dim": 127, "critic_vectors": ("state",)},
-            r"over 2 modalities \(image, proprio\): use a multiple of 2",
+            {"latent_dim": 5, "critic_vectors": ("state",)},
+            r"each of 2 modalities \(image, proprio\): use at least 6",
         ),
         ({"latent_dim": 24, "squash": "simplex"}, "multiple of 8 per modality, not 12: use .* 16"),
         (

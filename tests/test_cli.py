@@ -278,7 +278,7 @@ BAD = {
     "train reach_duplo --agent.tau 0": "(0, 1], not 0.0",
     "train reach_duplo --agent.tau 1.01": "(0, 1], not 1.01",
     "train reach_duplo --agent.tau nan": "(0, 1], not nan",
-    "train reach_duplo --agent.latent-dim 5": "leaves 2 for each of 2 modalities",
+    "train reach_duplo --agent.latent-dim 3": "leaves 1 for each of 2 modalities",
     "train reach_duplo --observations state": "--agent.vectors state",
     "train reach_duplo --updates-per-step inf": "updates-per-step must be at least 0, not inf",
     "train reach_duplo --agent.vectors joints": "the environment gives ['proprio', 'state']",

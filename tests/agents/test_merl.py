@@ -82,10 +82,10 @@ def test_what_does_not_split_evenly_is_rounded_down() -> None:
         ({"images": (), "vectors": ()}, "name some with --agent.images or --agent.vectors"),
         ({"vectors": ("proprio", "proprio")}, "names 'proprio' twice"),
         ({"images": (), "vectors": None, "critic_vectors": ("image",)}, "names 'image'"),
-        ({"latent_dim": 5}, "5 leaves 2 for each of 2 modalities"),
+        ({"latent_dim": 3}, "3 leaves 1 for each of 2 modalities"),
         (
-            {"latent_dim": 5, "critic_vectors": ("state",)},
-            r"each of 2 modalities \(image, proprio\): use at least 6",
+            {"latent_dim": 3, "critic_vectors": ("state",)},
+            r"each of 2 modalities \(image, proprio\): use at least 4",
         ),
         ({"latent_dim": 24, "squash": "simplex"}, "multiple of 8 per modality, not 12: use .* 16"),
         (
@@ -128,7 +128,7 @@ def test_a_users_keys_may_be_called_anything() -> None:
             "type": spaces.Box(0, 255, (16, 16, 3), np.uint8),
             "wrist camera": spaces.Box(0, 255, (20, 20, 1), np.uint8),
             "arm.joints": spaces.Box(-1, 1, (3,), np.float32),
-            "keys": spaces.Box(-1, 1, (2,), np.float32),
+            "training": spaces.Box(-1, 1, (2,), np.float32),
         }
     )
     agent = make(MERLConfig(latent_dim=8, hidden_dim=8), space)
@@ -136,7 +136,7 @@ def test_a_users_keys_may_be_called_anything() -> None:
         "type": torch.zeros((1, 3, 16, 16, 3), dtype=torch.uint8),
         "wrist camera": torch.zeros((1, 3, 20, 20, 1), dtype=torch.uint8),
         "arm.joints": torch.zeros((1, 3)),
-        "keys": torch.zeros((1, 2)),
+        "training": torch.zeros((1, 2)),
     }
     assert agent.act(observation, explore=False).shape == (1, 9)
     batch = Batch(

@@ -16,7 +16,7 @@ from merl.networks.heads import Actor, GaussianActor, HeadSize, TwinCritic
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
 
-LEAST_SHARE = 3
+LEAST_SHARE = 2
 """Numbers of the fused representation that a modality must have."""
 
 
@@ -152,7 +152,7 @@ def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
         MerlError: d is too small for so many, or for the groups of `simplex`.
     """
     share = config.latent_dim // len(senses)
-    # Of a single number, or of two, LayerNorm leaves nothing but a sign.
+    # Of a single number LayerNorm leaves nothing.
     if config.latent_dim and share < LEAST_SHARE:
         raise MerlError(
             f"agent.latent-dim {config.latent_dim} leaves {share} for each of {len(senses)} "

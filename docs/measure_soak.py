@@ -24,6 +24,7 @@ import numpy as np
 import psutil
 import tyro
 
+from merl.core import METRICS_FILE, MerlError
 from merl.report.curves import read_metrics
 from merl.training.checkpoint import Checkpoint
 from merl.training.run import Run
@@ -130,10 +131,11 @@ def soak(
             memory.append(_private_bytes(process.pid))
             time.sleep(min(1.0, lasts / 20))
         _kill_all(process)
-        step = Checkpoint.find(Run.open(run).checkpoints).step
+        step = _saved(run)
         if stretches and step < stretches[-1].step:
             raise SystemExit(f"step {stretches[-1].step} was saved, but now it stands at {step}")
-        reached = int(np.max(read_metrics(run)["step"], initial=step))
+        rows = read_metrics(run)["step"] if (run / METRICS_FILE).exists() else []
+        reached = int(np.max(rows, initial=step))
         half = memory[len(memory) // 2 :]  # after the start, with its measurements
         first, last = half[: len(half) // 4 + 1], half[-(len(half) // 4 + 1) :]
         stretches.append(
@@ -146,6 +148,14 @@ def soak(
         )
         tell(stretches[-1])
     return stretches
+
+
+def _saved(run: Path) -> int:
+    """The step of the last checkpoint; 0 of a run that was killed before its first one."""
+    try:
+        return Checkpoint.find(Run.open(run).checkpoints).step
+    except MerlError:
+        return 0
 
 
 def _kill_all(process: subprocess.Popen[str]) -> None:

@@ -29,7 +29,7 @@ from reference import Chance
 
 from merl.agents.ddpg import DDPG
 from merl.agents.drqv2 import DrQV2Config
-from merl.bench.measuring import circumstances, shown, spread, take_turns
+from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
 from merl.bench.update import ACTIONS, as_sample, noise_batch, reference_of
 from merl.core import Batch
 
@@ -52,13 +52,11 @@ def time(path: Path, repeats: int) -> None:
     theirs, _ = made_by_its_authors(path, hidden_dim=1024, actions=ACTIONS)
     sample, plain = as_sample(noise_batch(256), vector=False), reference_of("drqv2")
     given = (sample.image, sample.action, sample.reward, sample.discount, sample.next_image)
-    turns = take_turns(
-        {
-            "its authors'": lambda: theirs.update(iter([given]), DECISION),
-            "the reference": lambda: plain.update(sample),
-        },
-        repeats,
-    )
+    sides: dict[str, Work] = {
+        "its authors'": lambda: theirs.update(iter([given]), DECISION),
+        "the reference": lambda: plain.update(sample),
+    }
+    turns = take_turns(sides, repeats, others=sides)
     for side, seconds in turns.items():
         print(f"{side}: {shown(spread([1 / one for one in seconds]))} updates/s")
     ratio = [a / b for a, b in zip(*turns.values(), strict=True)]

@@ -33,16 +33,16 @@ def keep_freed_memory(keep: bool = True) -> bool:
     update of preset laptop, a third of one of the paper's size (docs/bench.md).
 
     Args:
-        keep: False for glibc's defaults, as they are before the first call.
+        keep: False for what glibc does by itself once it has met large blocks.
 
     Returns:
         Whether the C library has it: glibc does.
     """
-    mmap_max, trim_threshold, top_pad = -4, -1, -2  # malloc.h
+    mmap_threshold, mmap_max, trim_threshold, top_pad = -3, -4, -1, -2  # malloc.h
+    # The thresholds grow to these at the first free of a large block, unless they were ever set.
+    grown = {mmap_threshold: 32 << 20, trim_threshold: 64 << 20, top_pad: 128 << 10}
     values = (
-        {mmap_max: 0, trim_threshold: -1, top_pad: 64 << 20}
-        if keep
-        else {mmap_max: 65_536, trim_threshold: 128 << 10, top_pad: 128 << 10}
+        {mmap_max: 0, trim_threshold: -1, top_pad: 64 << 20} if keep else {mmap_max: 65_536} | grown
     )
     try:
         mallopt = ctypes.CDLL(None).mallopt

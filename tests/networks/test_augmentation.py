@@ -130,7 +130,7 @@ def test_shifts_follow_the_generator() -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
 def test_the_input(shape: tuple[int, ...], dtype: torch.dtype) -> None:
     images = pictures(shape)
     batch, stack, height, width, channels = shape
@@ -139,15 +139,15 @@ def test_the_input(shape: tuple[int, ...], dtype: torch.dtype) -> None:
     assert x.shape == (batch, stack * channels, height, width)
     for frame in range(stack):  # the oldest first, its channels together
         for channel in range(channels):
-            expected = images[:, frame, :, :, channel].to(torch.float64) / 255 - 0.5
-            found = x[:, frame * channels + channel].to(torch.float64)
-            torch.testing.assert_close(found, expected, rtol=0, atol=1e-7)
+            expected = images[:, frame, :, :, channel].to(torch.float64) - 128
+            assert torch.equal(x[:, frame * channels + channel].to(torch.float64), expected)
 
 
-def test_the_input_spans_half_to_each_side() -> None:
-    images = torch.tensor([0, 255], dtype=torch.uint8).reshape(2, 1, 1, 1, 1)
-    x = to_input(images, torch.float64)
-    torch.testing.assert_close(x.flatten(), torch.tensor([-0.5, 0.5], dtype=torch.float64))
+def test_the_input_is_exact_for_every_byte() -> None:
+    images = torch.arange(256, dtype=torch.uint8).reshape(256, 1, 1, 1, 1)
+    x = to_input(images, torch.bfloat16)
+    assert torch.equal(x.flatten().long(), torch.arange(256) - 128)
+    assert torch.equal(images.flatten().long(), torch.arange(256))  # which stay as they are
 
 
 def test_the_input_lies_channels_last() -> None:

@@ -4,10 +4,38 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
 from merl.core import MerlError
 from merl.networks.encoders import ConvEncoder, Standardize, VectorEncoder
+from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
+
+
+def noise(*shape: int) -> Tensor:
+    return torch.randint(0, 256, shape, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("shade", [0, 128, 255])
+def test_pixels_are_scaled_to_half_a_unit_on_each_side(shade: int) -> None:
+    encoder = ConvEncoder(6, (5, 5), channels=4, strides=(2,)).double()
+    stacks = torch.full((1, 2, 5, 5, 3), shade, dtype=torch.uint8)
+    scaled = torch.full((1, 6, 5, 5), shade / 255 - 0.5, dtype=torch.float64)
+    expected = encoder.convolutions(scaled).permute(0, 2, 3, 1).flatten(1)
+    torch.testing.assert_close(encoder(stacks), expected, rtol=0, atol=1e-12)
+
+
+def test_in_bf16_a_dark_picture_and_a_bright_one_are_as_near_as_in_single_precision() -> None:
+    """A bias that took in half of all weights would be rounded coarsely, the same for all."""
+    torch.manual_seed(0)
+    encoder = ConvEncoder(9, (84, 84))
+    orthogonal(encoder)
+    for dark, bright in ((0, 40), (110, 146), (215, 256)):
+        stacks = torch.randint(dark, bright, (2, 3, 84, 84, 3), dtype=torch.uint8)
+        exact = encoder(stacks)
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded = encoder(stacks)
+        assert (rounded - exact).norm() < 0.01 * exact.norm()
 
 
 def test_the_papers_encoder() -> None:
@@ -22,17 +50,17 @@ def test_the_papers_encoder() -> None:
 @pytest.mark.parametrize("strides", [(2, 1, 1, 1), (2, 2, 1), (1,), (3, 2)])
 def test_features_are_as_many_as_said(size: tuple[int, int], strides: tuple[int, ...]) -> None:
     encoder = ConvEncoder(6, size, channels=4, strides=strides)
-    assert encoder(torch.randn(2, 6, *size)).shape == (2, encoder.features)
+    assert encoder(noise(2, 3, *size, 2)).shape == (2, encoder.features)
 
 
 def test_features_go_by_rows_columns_channels() -> None:
     encoder = ConvEncoder(3, (9, 11), channels=4, strides=(2,))
-    images = torch.randn(2, 3, 9, 11)
-    maps = encoder.convolutions(images)  # (2, 4, 4, 5)
-    features = encoder(images)
+    stacks = noise(2, 3, 9, 11, 1)
+    maps = encoder.convolutions(stacks[..., 0] / 255 - 0.5)  # (2, 4, 4, 5)
+    features = encoder(stacks)
     for row, column, channel in [(0, 0, 0), (1, 3, 2), (3, 4, 3)]:
         flat = (row * 5 + column) * 4 + channel
-        assert torch.equal(features[:, flat], maps[:, channel, row, column])
+        torch.testing.assert_close(features[:, flat], maps[:, channel, row, column])
     assert features.min() >= 0  # a ReLU is the last thing
 
 

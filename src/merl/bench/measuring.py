@@ -4,29 +4,45 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
+from merl.resources import keep_freed_memory
 from merl.training.run import machine, package_versions
 
 Work = Callable[[], object]
 
 
-def take_turns(sides: Mapping[str, Work], repeats: int) -> dict[str, list[float]]:
-    """Seconds of each side in each round, after a first one that does not count.
+Side = TypeVar("Side", bound=Hashable)
+
+
+def take_turns(
+    sides: Mapping[Side, Work], repeats: int, others: Collection[Side] = ()
+) -> dict[Side, list[float]]:
+    """Seconds of each side in each round.
 
     The sides take turns within one run, so that a machine that is busy for a while is busy for all
-    of them.
+    of them. Each does its work once before it is timed: a turn finds the memory of its own last
+    one, not that of the side before.
+
+    Args:
+        sides: work by name.
+        repeats: how many rounds.
+        others: sides that are not ours, which the C library treats as it does by itself; training
+            asks it to keep freed memory.
     """
-    for work in sides.values():
-        work()
-    taken: dict[str, list[float]] = {side: [] for side in sides}
-    for _ in range(repeats):
-        for side, work in sides.items():
-            taken[side].append(seconds(work))
+    taken: dict[Side, list[float]] = {side: [] for side in sides}
+    try:
+        for _ in range(repeats):
+            for side, work in sides.items():
+                keep_freed_memory(side not in others)
+                work()
+                taken[side].append(seconds(work))
+    finally:
+        keep_freed_memory(False)
     return taken
 
 

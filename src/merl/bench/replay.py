@@ -1,7 +1,7 @@
 """How long the replay takes to give a batch, raw and compressed, and the space that it needs.
 
-A batch is 256 pairs of observations, of three 84x84 pictures each, that are stacked, shifted and
-turned into what the encoder reads. The pictures are an arm's, moved at random.
+A batch is 256 pairs of observations, of three 84x84 pictures each, stacked and shifted: bytes are
+what the networks take. The pictures are an arm's, moved at random.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from rich.table import Table
+from torch import Tensor
 
 from merl.bench.measuring import Work, circumstances, seconds, shown, spread, take_turns
 from merl.core import Transition
@@ -23,6 +24,7 @@ from merl.replay import Replay, ReplayConfig, replay_bytes
 
 EPISODE, PAD, MILLION = 250, 4, 1_000_000
 RAW, COMPRESSED = "raw", "compressed (--replay.compress)"
+STAGES = ("sample", "ready", "input")
 BARS_MS = {RAW: 15.0, COMPRESSED: 35.0}
 BARS_GB = {RAW: 22.0, COMPRESSED: 6.0}
 
@@ -36,8 +38,9 @@ def run(repeats: int = 15, steps: int = 10_000, batch_size: int = 256) -> dict[s
         batch_size: B.
 
     Returns:
-        Plain values, by side: `sample_ms` and `ready_ms` (what is sampled, and that shifted and
-        turned into input) and `write_us` for a step, each as `median`, `low` and `high`;
+        Plain values, by side: `sample_ms`, `ready_ms` (what is sampled, and that shifted),
+        `input_ms` (and as the numbers that the first convolution multiplies, in fp32, which is the
+        encoder's part) and `write_us` for a step, each as `median`, `low` and `high`;
         `picture_bytes`, what a picture of this task takes; `gigabytes`, what a million steps
         reserve; the circumstances.
     """
@@ -53,28 +56,20 @@ def table(result: dict[str, Any]) -> Table:
     """What `run` returned, for people."""
     title = f"{result['batch_size']} pairs of 3 pictures 84x84 from {result['steps']:,} steps"
     rows = Table(title=f"{title}, one thread, median of {result['repeats']} (least to most)")
-    for heading in (
-        "",
-        "sampled, ms",
-        "ready for the network, ms",
-        "bar",
-        "write a step, us",
-        "a picture, bytes",
-        "a million steps, GB",
-        "bar ",
-    ):
+    for heading in ("", *BARS_MS):
         rows.add_column(heading, justify="right" if heading else "left")
-    for side in (RAW, COMPRESSED):
-        rows.add_row(
-            side,
-            shown(result["sample_ms"][side]),
-            shown(result["ready_ms"][side]),
-            f"{BARS_MS[side]:g}",
-            shown(result["write_us"][side]),
-            f"{result['picture_bytes'][side]:,.0f}",
-            f"{result['gigabytes'][side]:.3g}",
-            f"{BARS_GB[side]:g}",
-        )
+
+    def add(name: str, key: str) -> None:
+        rows.add_row(name, *(shown(result[key][side]) for side in BARS_MS))
+
+    add("sampled, ms", "sample_ms")
+    add("and shifted: ready for the networks, ms", "ready_ms")
+    rows.add_row("    the bar", *(f"{bar:g}" for bar in BARS_MS.values()))
+    add("and as the numbers that the encoder makes of it, ms", "input_ms")
+    add("a step written, us", "write_us")
+    rows.add_row("a picture, bytes", *(f"{result['picture_bytes'][s]:,.0f}" for s in BARS_MS))
+    rows.add_row("a million steps, GB", *(f"{result['gigabytes'][s]:.3g}" for s in BARS_GB))
+    rows.add_row("    the bar", *(f"{bar:g}" for bar in BARS_GB.values()))
     return rows
 
 
@@ -97,15 +92,19 @@ def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
             rings[side] = Replay(config, space, actions, directory=directory)
             writing[side] = _fill(rings[side], seen, actions, steps)
             sizes[side] = _mean_bytes(directory, space)
-        sampling = take_turns(
-            {side: _sampler(ring, batch_size) for side, ring in rings.items()}, repeats
+        taken = take_turns(
+            {
+                (stage, side): work
+                for side, ring in rings.items()
+                for stage, work in _stages(ring, batch_size).items()
+            },
+            repeats,
         )
-        ready = take_turns(
-            {side: _readier(ring, batch_size) for side, ring in rings.items()}, repeats
-        )
+    for stage in STAGES:
+        result[f"{stage}_ms"] = {
+            side: spread([1e3 * t for t in taken[stage, side]]) for side in BARS_MS
+        }
     return result | {
-        "sample_ms": {side: spread([1e3 * t for t in times]) for side, times in sampling.items()},
-        "ready_ms": {side: spread([1e3 * t for t in times]) for side, times in ready.items()},
         "write_us": {side: spread(times) for side, times in writing.items()},
         "picture_bytes": sizes,
         "gigabytes": million,
@@ -156,18 +155,18 @@ def _mean_bytes(directory: Path, space: spaces.Dict) -> float:
     return float(lengths[lengths > 0].mean())
 
 
-def _sampler(ring: Replay, batch_size: int) -> Work:
-    rng = np.random.default_rng(0)
-    return lambda: ring.sample(batch_size, rng)
-
-
-def _readier(ring: Replay, batch_size: int) -> Work:
+def _stages(ring: Replay, batch_size: int) -> dict[str, Work]:
+    """A batch, as far as each of `STAGES`."""
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
 
-    def ready() -> None:
+    def sample() -> list[Tensor]:
         batch = ring.sample(batch_size, rng)
-        for observation in (batch.observation, batch.next_observation):
-            shifts = draw_shifts(batch_size, PAD, generator)
-            to_input(shift(observation["image"], shifts, PAD), torch.float32)
+        return [batch.observation["image"], batch.next_observation["image"]]
 
-    return ready
+    def ready() -> list[Tensor]:
+        return [shift(stack, draw_shifts(batch_size, PAD, generator), PAD) for stack in sample()]
+
+    def as_input() -> list[Tensor]:
+        return [to_input(stack, torch.float32) for stack in ready()]
+
+    return dict(zip(STAGES, (sample, ready, as_input), strict=True))

@@ -49,7 +49,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
     """Time an update on every side, on a GPU where there is one, else on all threads.
 
     Args:
-        repeats: how many rounds, in each of which every side makes one update.
+        repeats: how many rounds, in each of which every side has its turn.
         batch_size: B.
 
     On a GPU each turn is `UPDATES_ON_GPU` updates, and beside the update from a batch that lies on
@@ -99,7 +99,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
         of[SB3], result["stable_baselines"] = REFERENCE, SB3_DIFFERS
     except MerlError as reason:
         result["skipped"] = f"{SB3}: {reason}"
-    taken = take_turns(sides, repeats)
+    taken = take_turns(sides, repeats, others=(REFERENCE, DRQV2, SB3))
     result["updates_per_s"] = {
         side: spread([times / t for t in each]) for side, each in taken.items()
     }

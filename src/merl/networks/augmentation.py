@@ -75,9 +75,11 @@ def _shift_by_index(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
 
 
 def to_input(images: Tensor, dtype: torch.dtype) -> Tensor:
-    """Stacked bytes (B, K, H, W, C) to what the encoder reads: (B, K C, H, W), x / 255 - 0.5.
+    """Stacked bytes (B, K, H, W, C) to what a convolution reads: (B, K C, H, W), x - 128.
 
-    The memory is in channels-last order, which is what convolutions are fastest with.
+    These whole numbers are exact in bf16, which x / 255 - 0.5 is not; the scale is left to the
+    weights (`encoders.ConvEncoder`). The memory is in channels-last order, which convolutions are
+    fastest with.
     """
     batch, stack, height, width, channels = images.shape
     interleaved = images.new_empty((batch, height, width, stack, channels))
@@ -85,5 +87,5 @@ def to_input(images: Tensor, dtype: torch.dtype) -> Tensor:
     for frame in range(stack):
         for channel in range(channels):
             interleaved[..., frame, channel] = images[:, frame, ..., channel]
-    pixels = interleaved.flatten(3).to(dtype)
-    return pixels.mul_(1.0 / 255.0).sub_(0.5).permute(0, 3, 1, 2)
+    centred = interleaved.bitwise_xor_(128).view(torch.int8)  # of a byte: less 128
+    return centred.flatten(3).to(dtype).permute(0, 3, 1, 2)

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from merl.core import MerlError
+from merl.networks.augmentation import to_input
 
 
 class ConvEncoder(nn.Module):
@@ -51,10 +53,27 @@ class ConvEncoder(nn.Module):
         self.features = channels * height * width
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Images (B, C, H, W) in [-0.5, 0.5] to features (B, F): rows, columns, channels."""
-        maps: Tensor = self.convolutions(images)  # (B, 32, h, w)
+    def forward(self, stacks: Tensor) -> Tensor:
+        """Stacked frames, uint8 (B, K, H, W, C), to features (B, F): rows, columns, channels."""
+        first, *others = self.convolutions
+        assert isinstance(first, nn.Conv2d)
+        assert first.bias is not None
+        # x / 255 - 0.5 = (x - 128) / 255 + 1 / 510, which its weights and bias take in: a few
+        # numbers are multiplied in place of all pixels.
+        weight = first.weight / 255.0
+        bias = first.bias + first.weight.sum(dim=(1, 2, 3)) / 510.0
+        pixels = to_input(stacks, _precision(first.weight))
+        maps = functional.conv2d(pixels, weight, bias, first.stride)  # (B, 32, h, w)
+        for layer in others:
+            maps = layer(maps)
         return maps.permute(0, 2, 3, 1).flatten(1)  # a view: the memory is channels-last
+
+
+def _precision(weight: Tensor) -> torch.dtype:
+    """What a layer with this weight computes in: the weight's own, or autocast's."""
+    device = weight.device.type
+    enabled = torch.is_autocast_enabled(device)
+    return torch.get_autocast_dtype(device) if enabled else weight.dtype
 
 
 class Standardize(nn.Module):

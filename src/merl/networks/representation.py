@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from torch import Tensor, nn
 
-from merl.networks.augmentation import shift, to_input
+from merl.networks.augmentation import shift
 from merl.networks.encoders import ConvEncoder, VectorEncoder
 from merl.networks.names import module_name
 
@@ -55,14 +55,13 @@ class Encoders(nn.Module):
         Returns:
             {key: (B, F_key)}, images first.
         """
-        dtype = next(self.parameters(), observation[next(iter(observation))]).dtype
         encoded: dict[str, Tensor] = {}
         for key, encoder in zip(self.image_keys, self.images.values(), strict=True):
             if key not in observation:
                 continue
             stack = observation[key]
             moved = shift(stack, shifts[key], self.pad) if shifts else stack
-            encoded[key] = encoder(to_input(moved, dtype))
+            encoded[key] = encoder(moved)
         for key, encoder in zip(self.vector_keys, self.vectors.values(), strict=True):
             if key in observation:
                 encoded[key] = encoder(observation[key])

@@ -1,4 +1,4 @@
-"""What this process may use: memory and disk, and how it holds on to them."""
+"""What this process may use: memory, threads and disk, and how it holds on to them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+MOST_PICTURE_THREADS = 4
+"""What a picture of an arm's camera can make use of."""
+
 _ZEROS = bytes(1 << 20)
+_allowed_threads: int | None = None
 
 
 def available_memory(root: Path = Path("/")) -> int:
@@ -49,6 +53,18 @@ def keep_freed_memory(keep: bool = True) -> bool:
     except (OSError, AttributeError):
         return False
     return all(mallopt(name, value) for name, value in values.items())
+
+
+def allow_picture_threads(count: int | None) -> None:
+    """Let a picture be drawn by so many threads of this process; None: one for each core."""
+    global _allowed_threads
+    _allowed_threads = count
+
+
+def picture_threads() -> int:
+    """How many threads may draw a picture, `MOST_PICTURE_THREADS` at most."""
+    allowed = _allowed_threads or len(os.sched_getaffinity(0))
+    return max(1, min(allowed, MOST_PICTURE_THREADS))
 
 
 def free_disk(directory: Path) -> int:

@@ -13,6 +13,7 @@ from dm_control import manipulation
 from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.rendering import check_renderer
+from merl.resources import allow_picture_threads
 
 NO_OPENGL = "no OpenGL library works on this machine"
 
@@ -159,6 +160,23 @@ def test_two_threads_see_what_one_sees():
         np.testing.assert_array_equal(seen, pictures(seed))
 
 
+@pytest.mark.parametrize("task", ["reach_duplo", "lift_box"])
+def test_any_number_of_threads_draws_the_same_picture(task):
+    env = make_env(task, renderer="warp", image_size=33)
+    try:
+        for threads in (1, 2, 3, 100):
+            allow_picture_threads(threads)
+            seen = [env.reset(seed=0)[0]["image"]]
+            seen += [env.step(np.ones(9, np.float32))[0]["image"] for _ in range(3)]
+            if threads == 1:
+                alone = seen
+            np.testing.assert_array_equal(seen, alone)
+    finally:
+        allow_picture_threads(None)
+        env.close()
+    assert np.ptp(alone) > 0
+
+
 @pytest.mark.parametrize("size", [16, 700])
 @pytest.mark.parametrize("renderer", ["warp", "gl"])
 def test_any_size(renderer, size, request):
@@ -223,7 +241,7 @@ def test_gl_after_warp_in_one_process(opengl, warp_env):
 
 
 def test_warp_works_without_a_home_and_says_when_it_compiles(tmp_path):
-    code = "from merl.envs import rendering; rendering._start_warp(); import warp;"
+    code = "from merl.envs import ray_tracing; ray_tracing._start_warp(); import warp;"
     code += "print(warp.config.kernel_cache_dir)"
     home = tmp_path / "a file, so that no folder can be made in it"
     home.touch()

@@ -25,7 +25,7 @@ from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness, Stage, train
 from merl.training.rollout import FrameStack
-from merl.training.timing import measure
+from merl.training.timing import measure, use_threads
 from merl.training.updating import update_from_host
 
 STRICT = "strict: one environment, in turn with the learner"
@@ -61,7 +61,7 @@ def run(
         agent = dataclasses.replace(config.agent, precision=best.precision)
         config = dataclasses.replace(config, agent=agent, threads=best.threads)
         result |= {"precision": best.precision, "threads": best.threads}
-        torch.set_num_threads(best.threads)
+        use_threads(best.threads)
         loops = {
             side: _Loop(dataclasses.replace(config, **asked), stack)
             for side, asked in _sides().items()

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import tyro
 from rich.console import Console
 
@@ -19,6 +18,7 @@ from merl.report.references import references
 from merl.training.console import describe
 from merl.training.evaluation import EVALUATION_SEED, load_policy
 from merl.training.evaluation import evaluate as evaluate_policy
+from merl.training.timing import use_threads
 from merl.training.video import MIN_SIDE
 
 
@@ -50,7 +50,7 @@ def evaluate(args: list[str]) -> int:
     console = Console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     # As the run had it: several threads wait for each other where the machine does other work, too.
-    torch.set_num_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))
+    use_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))
     changes: dict[str, Any] = {} if options.renderer is None else {"renderer": options.renderer}
     if options.video is not None:
         size = max(policy.config.env.render_size, MIN_SIDE)

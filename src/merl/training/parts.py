@@ -23,7 +23,7 @@ from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness
 from merl.training.run import refuse_existing, run_path
-from merl.training.timing import measure
+from merl.training.timing import measure, use_threads
 from merl.training.video import MIN_SIDE
 
 
@@ -54,7 +54,7 @@ class Parts:
         keep_freed_memory()
         self.timing = measure(config, env, eval_env, self.space, self.device)
         best = self.timing.best
-        torch.set_num_threads(best.threads)
+        use_threads(best.threads)
         self.config = dataclasses.replace(
             config,
             threads=best.threads,

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.core import Batch, is_image
+from merl.resources import allow_picture_threads
 from merl.training.config import TrainConfig
 
 REPEATS = 3
@@ -95,7 +96,7 @@ def measure(
     update: dict[Arithmetic, float] = {}
 
     def attempt(arithmetic: Arithmetic) -> DDPG:
-        torch.set_num_threads(arithmetic.threads)
+        use_threads(arithmetic.threads)
         agent = _agent(config, space, batch, device, arithmetic.precision)
         update[arithmetic] = _time_update(agent, batch)
         return agent
@@ -105,10 +106,16 @@ def measure(
     fastest = min(update, key=lambda arithmetic: update[arithmetic])
     if config.threads is None and cores > threads:
         attempt(Arithmetic(fastest.precision, cores))
-    torch.set_num_threads(threads)
+    use_threads(threads)
     films = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
     frame = _time_frame(eval_env) if films else 0.0
     return Timing(update, _time_step(env) + _time_acting(agent, batch), frame)
+
+
+def use_threads(count: int) -> None:
+    """Let updates and pictures of this process take so many threads."""
+    torch.set_num_threads(count)
+    allow_picture_threads(count)
 
 
 def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:

@@ -126,19 +126,24 @@ def small_tasks() -> None:
     with (DATA / "small_tasks.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["task"] == SPLIT]
     runs = {
-        f"{agent}, {sense}": [
+        label: [
             Curve(
                 *np.array(
                     [
                         (float(row["step"]), float(row["return"]))
                         for row in rows
-                        if (row["agent"], row["seed"]) == (agent, seed)
+                        if (row["agent"], row["precision"], row["seed"]) == (*which, seed)
                     ]
                 ).T
             )
             for seed in sorted({row["seed"] for row in rows})
         ]
-        for agent, sense in (("merl", "both"), ("drqv2", "camera"), ("proprio", "joints"))
+        for label, which in (
+            ("merl, both", ("merl", "fp32")),
+            ("merl, both, in bf16", ("merl", "bf16")),
+            ("drqv2, camera", ("drqv2", "fp32")),
+            ("proprio, joints", ("proprio", "fp32")),
+        )
     }
     still = np.mean(returns_of(lambda env: 0 * env.best_action(), SPLIT))
     learning_curves(

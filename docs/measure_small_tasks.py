@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from merl.experiments.small_tasks import CASES, WHOLE, learn, optimum, returns_of
+from merl.experiments.small_tasks import CASES, WHOLE, Case, learn, optimum, returns_of
 from merl.report.curves import read_metrics
 from merl.statistics import bootstrap_interval
 
@@ -21,35 +21,39 @@ OUTPUT = Path(__file__).parent / "data" / "small_tasks.csv"
 COLUMNS = {"step": "step", "return": "eval/return"} | {
     end: f"eval/return_{end}" for end in ("low", "high")
 }
-FIELDS = ("task", "agent", "seed", *COLUMNS)
+FIELDS = ("task", "agent", "precision", "seed", *COLUMNS)
 
 
 def main() -> None:
     """Measure what is missing, then print the means."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     rows = _read()
-    for task, agent, steps in CASES:
+    for case in CASES:
         for seed in range(seeds):
-            this = {"task": task, "agent": agent, "seed": str(seed)}
-            if any(row == row | this | {"step": str(steps)} for row in rows):
+            this = _named(case) | {"seed": str(seed)}
+            if any(row == row | this | {"step": str(case.steps)} for row in rows):
                 continue
-            rows += [this | row for row in measured(task, agent, seed, steps)]
+            rows += [this | row for row in measured(case, seed)]
             _write(rows)
             print(*rows[-1].values(), flush=True)
     best, still = optimum(WHOLE), np.mean(returns_of(lambda env: 0 * env.best_action(), WHOLE))
     print(f"the dot: straight to the mark {best:.2f}, standing still {still:.2f}")
-    for task, agent, steps in CASES:
-        this = {"task": task, "agent": agent, "step": str(steps)}
+    for case in CASES:
+        this = _named(case) | {"step": str(case.steps)}
         told = [float(row["return"]) for row in rows if row == row | this]
         mean, low, high = bootstrap_interval(told)
-        print(f"{task} {agent}, {steps} steps: {mean:.2f} [{low:.2f}, {high:.2f}]", sorted(told))
+        print(f"{' '.join(map(str, case))} steps: {mean:.2f} [{low:.2f}, {high:.2f}]", sorted(told))
 
 
-def measured(task: str, agent: str, seed: int, steps: int) -> list[dict[str, str]]:
+def _named(case: Case) -> dict[str, str]:
+    return {"task": case.task, "agent": case.agent, "precision": case.precision}
+
+
+def measured(case: Case, seed: int) -> list[dict[str, str]]:
     """Every evaluation of one run."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        learn(task, agent, seed=seed, steps=steps, run_dir=run, evaluations=EVALUATIONS)
+        learn(case, seed=seed, run_dir=run, evaluations=EVALUATIONS)
         metrics = read_metrics(run)
     return [
         {field: f"{metrics[column][row]:.7g}" for field, column in COLUMNS.items()}

@@ -5,26 +5,30 @@ from __future__ import annotations
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from merl.experiments.small_tasks import (
     CASES,
     PENDULUM,
     SPLIT,
     WHOLE,
+    Case,
+    Precision,
     learn,
     optimum,
     returns_of,
 )
+from merl.report.curves import read_metrics
 from merl.statistics import bootstrap_interval
 
-STEPS = {(task, agent): steps for task, agent, steps in CASES}
+STEPS = {(case.task, case.agent): case.steps for case in CASES}
 
 
 def mean_return(task: str, agent: str, seed: int, folder: Path, steps: int | None = None) -> float:
-    run = folder / f"{agent}-{seed}"
-    steps = steps or STEPS[task, agent]
-    return learn(task, agent, seed=seed, steps=steps, run_dir=run).returns.mean
+    case = Case(task, agent, steps or STEPS[task, agent])
+    return learn(case, seed=seed, run_dir=folder / f"{agent}-{seed}").returns.mean
 
 
 @pytest.mark.long
@@ -61,3 +65,22 @@ def test_only_with_both_senses_the_split_task_is_solved(tmp_path: Path) -> None:
     assert intervals["merl"].mean > 0.85 * optimum(SPLIT)
     for alone in ("drqv2", "proprio"):
         assert intervals[alone].high < intervals["merl"].low
+
+
+@pytest.mark.long
+def test_in_bf16_an_agent_learns_as_in_single_precision(tmp_path: Path) -> None:
+    """The mean of its curves lies within two standard deviations of the seeds in fp32."""
+    steps = STEPS[SPLIT, "merl"]
+
+    def curves(precision: Precision, seeds: int) -> NDArray[np.float64]:
+        told = []
+        for seed in range(seeds):
+            run = tmp_path / f"{precision}-{seed}"
+            learn(Case(SPLIT, "merl", steps, precision), seed=seed, run_dir=run, evaluations=4)
+            curve = read_metrics(run)["eval/return"]
+            told.append(curve[~np.isnan(curve)])
+        return np.stack(told)  # (seeds, evaluations)
+
+    single, half = curves("fp32", 5), curves("bf16", 3)
+    apart = abs(half.mean(axis=0) - single.mean(axis=0))
+    assert (apart < 2 * single.std(axis=0, ddof=1)).all()

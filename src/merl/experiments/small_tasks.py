@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -25,18 +25,31 @@ from merl.training.parts import Parts
 from merl.training.run import Run
 
 WHOLE, SPLIT, PENDULUM = "merl.envs.dot:whole", "merl.envs.dot:split", "Pendulum-v1"
-CASES = (
-    (WHOLE, "merl", 10_000),
-    (WHOLE, "drqv2", 10_000),
-    (SPLIT, "merl", 8000),
-    (SPLIT, "drqv2", 8000),
-    (SPLIT, "proprio", 8000),
-    (PENDULUM, "ddpg", 20_000),
-    (PENDULUM, "sac", 20_000),
-)
-"""Task, agent, steps: what is shown in docs/small_tasks.md."""
+Precision = Literal["fp32", "bf16"]
 
-_SMALL: dict[str, Any] = {"hidden_dim": 128, "precision": "fp32"}
+
+class Case(NamedTuple):
+    """An agent that learns a task for so many steps."""
+
+    task: str
+    agent: str
+    steps: int
+    precision: Precision = "fp32"
+
+
+CASES = (
+    Case(WHOLE, "merl", 10_000),
+    Case(WHOLE, "drqv2", 10_000),
+    Case(SPLIT, "merl", 8000),
+    Case(SPLIT, "merl", 8000, "bf16"),
+    Case(SPLIT, "drqv2", 8000),
+    Case(SPLIT, "proprio", 8000),
+    Case(PENDULUM, "ddpg", 20_000),
+    Case(PENDULUM, "sac", 20_000),
+)
+"""What is shown in docs/small_tasks.md."""
+
+_SMALL: dict[str, Any] = {"hidden_dim": 128}
 _PENDULUM: dict[str, Any] = _SMALL | {"learning_rate": 1e-3}
 _DOT: dict[str, Any] = _SMALL | {
     "learning_rate": 5e-4,
@@ -48,14 +61,14 @@ _DOT_DISCOUNT = 0.8
 """The mark is at most ten steps away; a longer horizon only makes the values slow to grow."""
 
 
-def small_config(
-    task: str, agent: str, *, seed: int, steps: int, run_dir: Path, evaluations: int = 1
-) -> TrainConfig:
+def small_config(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> TrainConfig:
     """How an agent is trained on a small task, and how often it is evaluated on the way."""
+    task, agent, steps, precision = case
     chosen = AGENTS[agent]
     values, discount = (_PENDULUM, 0.99) if task == PENDULUM else (_DOT, _DOT_DISCOUNT)
+    values = values | {"precision": precision}
     if chosen.noise_std_end is not None:
-        values = values | {"noise_steps": steps // 2}
+        values |= {"noise_steps": steps // 2}
     return TrainConfig(
         task,
         preset="small",
@@ -75,13 +88,9 @@ def small_config(
     )
 
 
-def learn(
-    task: str, agent: str, *, seed: int, steps: int, run_dir: Path, evaluations: int = 1
-) -> Evaluation:
+def learn(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> Evaluation:
     """Train, and evaluate over 20 episodes without noise; all evaluations are in its metrics."""
-    config = small_config(
-        task, agent, seed=seed, steps=steps, run_dir=run_dir, evaluations=evaluations
-    )
+    config = small_config(case, seed=seed, run_dir=run_dir, evaluations=evaluations)
     with Parts.prepare(config, new=True) as parts:
         outcome = trainer.start(parts, _Silent())
     assert outcome.evaluation is not None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Any
 
@@ -16,10 +17,11 @@ import torch
 from rich.table import Table
 
 from merl.agents import make_agent
-from merl.bench.measuring import circumstances, shown, spread
+from merl.bench.measuring import Side, circumstances, shown, spread
 from merl.core import is_image
 from merl.experiments.presets import compose
 from merl.replay import Lanes
+from merl.resources import keep_freed_memory
 from merl.training.acting import Environments, Here, Workers
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
@@ -50,9 +52,35 @@ def run(
         Plain values: `steps_per_s` by side and `ratio` to the strict loop, each as `median`, `low`
         and `high` over the rounds; `precision`, `threads` and `updates_per_step`.
     """
-    config = dataclasses.replace(compose(preset, task), random_steps=WARM_UP, seed_steps=WARM_UP)
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "task": task, "preset": preset}
-    result |= {"updates_per_step": config.updates_per_step} | circumstances()
+    result |= circumstances()
+    rates, config = steps_per_second(_sides(), task, preset, repeats, steps)
+    result |= {
+        "precision": config.agent.precision,
+        "threads": config.threads,
+        "updates_per_step": config.updates_per_step,
+    }
+    result["steps_per_s"] = {side: spread(values) for side, values in rates.items()}
+    result["ratio"] = {
+        side: spread([a / b for a, b in zip(values, rates[STRICT], strict=True)])
+        for side, values in rates.items()
+    }
+    return result
+
+
+def steps_per_second(
+    sides: Mapping[Side, Mapping[str, Any]], task: str, preset: str, repeats: int, steps: int
+) -> tuple[dict[Side, list[float]], TrainConfig]:
+    """The rate of the loop in each round, and with which values it was run.
+
+    Args:
+        sides: by name, the fields of `TrainConfig` in which a way to run it differs.
+        task: what is trained on.
+        preset: whose values.
+        repeats: how many rounds, in each of which every side has its turn.
+        steps: environment steps of a turn.
+    """
+    config = dataclasses.replace(compose(preset, task), random_steps=WARM_UP, seed_steps=WARM_UP)
     with ExitStack() as stack:
         env = make_run_env(config)
         stack.callback(env.close)
@@ -60,24 +88,20 @@ def run(
         best = measure(config, env, env, space, torch.device("cpu")).best
         agent = dataclasses.replace(config.agent, precision=best.precision)
         config = dataclasses.replace(config, agent=agent, threads=best.threads)
-        result |= {"precision": best.precision, "threads": best.threads}
         use_threads(best.threads)
+        keep_freed_memory()
+        stack.callback(keep_freed_memory, False)
         loops = {
             side: _Loop(dataclasses.replace(config, **asked), stack)
-            for side, asked in _sides().items()
+            for side, asked in sides.items()
         }
         for loop in loops.values():
             loop.rate(WARM_UP + steps)
-        rates: dict[str, list[float]] = {side: [] for side in loops}
+        rates: dict[Side, list[float]] = {side: [] for side in loops}
         for _ in range(repeats):
             for side, loop in loops.items():
                 rates[side].append(loop.rate(steps))
-    result["steps_per_s"] = {side: spread(values) for side, values in rates.items()}
-    result["ratio"] = {
-        side: spread([a / b for a, b in zip(values, rates[STRICT], strict=True)])
-        for side, values in rates.items()
-    }
-    return result
+    return rates, config
 
 
 def table(result: dict[str, Any]) -> Table:

@@ -1,0 +1,231 @@
+"""How cost grows with batch, picture, environments and replay: python docs/measure_scaling.py.
+
+Numbers go to docs/data/scaling.csv, the picture to docs/images/scaling.png; `--plot-only` draws
+what is there. All sizes of one question take turns, in rounds; wall-clock time, so leave the
+machine alone. The updates are the paper's (six layers) in bf16, on all cores.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from gymnasium import spaces
+from matplotlib.axes import Axes
+from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter
+
+from merl.agents import AGENTS, make_agent
+from merl.bench.measuring import Work, circumstances, spread, take_turns
+from merl.bench.train import steps_per_second
+from merl.core import Batch, Transition
+from merl.envs import make_env
+from merl.replay import Replay, ReplayConfig
+from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
+from merl.resources import free_disk
+from merl.training.timing import use_threads
+
+HERE = Path(__file__).parent
+CSV, PICTURE = HERE / "data" / "scaling.csv", HERE / "images" / "scaling.png"
+FIELDS = ("question", "side", "x", "median", "low", "high")
+BATCHES = (16, 32, 64, 128, 256, 512)
+SIDES = (32, 48, 64, 84, 100, 128)
+ENVIRONMENTS = (1, 2, 3, 4)
+CAPACITIES = (1000, 10_000, 100_000, 300_000)
+STACK, PROPRIO, ACTIONS, EPISODE = 3, 24, 9, 250
+ACTION_SPACE = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
+
+Row = tuple[str, str, int, float, float, float]
+
+
+def main(repeats: int = 7, plot_only: bool = False) -> None:
+    """Measure every question, then draw.
+
+    Args:
+        repeats: rounds.
+        plot_only: draw what was measured before.
+    """
+    if not plot_only:
+        print(circumstances())
+        use_threads(torch.get_num_threads())
+        with CSV.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(FIELDS)
+            for ask in (batches, sides, environments, capacities):
+                for row in ask(repeats):
+                    writer.writerow(row)
+                    print(*row, flush=True)
+    draw()
+
+
+def batches(repeats: int) -> Iterator[Row]:
+    """Milliseconds of an update, by the samples in it."""
+    works = {("update", size): _update(size, 84) for size in BATCHES}
+    yield from _rows("batch", works, repeats)
+
+
+def sides(repeats: int) -> Iterator[Row]:
+    """Milliseconds of an update of 128 samples and of an environment's step, by picture."""
+    works: dict[tuple[str, int], Work] = {}
+    with ExitStack() as stack:
+        for side in SIDES:
+            works["update of 128", side] = _update(128, side)
+            env = make_env("reach_duplo", renderer="warp", image_size=side)
+            stack.callback(env.close)
+            env.reset(seed=0)
+            works["step with its picture", side] = partial(env.step, np.zeros(ACTIONS, np.float32))
+        yield from _rows("image", works, repeats)
+
+
+def environments(repeats: int) -> Iterator[Row]:
+    """Steps a second of the whole loop of preset laptop, by environments beside the learner."""
+    ways: dict[tuple[str, int], dict[str, Any]] = {("strict", 1): {}}
+    for count in ENVIRONMENTS:
+        ways["beside the learner", count] = {"synchronous": False, "num_envs": count}
+    rates, _ = steps_per_second(ways, "reach_duplo", "laptop", repeats, steps=60)
+    for (side, count), each in rates.items():
+        yield _row("environments", side, count, each)
+
+
+def capacities(repeats: int) -> Iterator[Row]:
+    """Milliseconds to sample 256 pairs, by the steps in the replay."""
+    seen = _arm()
+    with tempfile.TemporaryDirectory() as folder:
+        works: dict[tuple[str, int], Work] = {}
+        for compress in (False, True):
+            for capacity in CAPACITIES:
+                if capacity * 21_200 > 0.5 * free_disk(Path(folder)):
+                    continue
+                config = ReplayConfig(capacity=capacity, compress=compress)
+                place = Path(folder) / f"{capacity}-{compress}"
+                space = _space(84)
+                ring = Replay(config, space, ACTION_SPACE, directory=place)
+                _fill(ring, seen, capacity)
+                rng = np.random.default_rng(0)
+                name = "compressed" if compress else "raw"
+                works[name, capacity] = partial(ring.sample, 256, rng)
+        yield from _rows("replay", works, repeats)
+
+
+def _rows(question: str, works: Mapping[tuple[str, int], Work], repeats: int) -> Iterator[Row]:
+    for (side, x), each in take_turns(works, repeats).items():
+        yield _row(question, side, x, [1e3 * seconds for seconds in each])
+
+
+def _row(question: str, side: str, x: int, values: list[float]) -> Row:
+    told = spread(values)
+    return question, side, x, told["median"], told["low"], told["high"]
+
+
+def _update(size: int, side: int) -> Work:
+    config = dataclasses.replace(AGENTS["merl"], head_layers=6, precision="bf16")
+    device = torch.device("cpu")
+    agent = make_agent(config, _space(side), ACTION_SPACE, frame_stack=STACK, seed=0, device=device)
+    return partial(agent.update, _batch(size, side))
+
+
+def _batch(size: int, side: int) -> Batch:
+    generator = torch.Generator().manual_seed(0)
+
+    def observation() -> dict[str, torch.Tensor]:
+        shape = (size, STACK, side, side, 3)
+        return {
+            "image": torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator),
+            "proprio": torch.randn((size, PROPRIO), generator=generator),
+        }
+
+    action = torch.rand((size, ACTIONS), generator=generator) * 2 - 1
+    reward = torch.rand(size, generator=generator)
+    return Batch(observation(), action, reward, torch.full((size,), 0.97), observation())
+
+
+def _space(side: int) -> spaces.Dict:
+    return spaces.Dict(
+        {
+            "image": spaces.Box(0, 255, (side, side, 3), np.uint8),
+            "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO,), np.float32),
+        }
+    )
+
+
+def _arm() -> list[dict[str, Any]]:
+    """What an arm that is moved at random sees in an episode."""
+    env = make_env("reach_duplo", renderer="warp")
+    observation, _ = env.reset(seed=0)
+    seen = [observation]
+    for _ in range(EPISODE):
+        seen.append(env.step(ACTION_SPACE.sample())[0])
+    env.close()
+    return seen
+
+
+def _fill(ring: Replay, seen: list[dict[str, Any]], steps: int) -> None:
+    action = np.zeros(ACTIONS, np.float32)
+    for step in range(steps):
+        if step % EPISODE == 0:
+            ring.begin(seen[0])
+        now = step % EPISODE + 1
+        ring.add(Transition(action, 0.0, 1.0, seen[now], last=now == EPISODE))
+
+
+def draw() -> None:
+    """A panel for each question."""
+    with CSV.open() as file:
+        rows = list(csv.DictReader(file))
+    figure = new_figure(6.4)
+    panels = figure.subplots(2, 2)
+    _panel(panels[0, 0], rows, "batch", "milliseconds", "samples in a batch, 84x84", log=True)
+    _panel(panels[0, 1], rows, "image", "milliseconds", "pixels a side", log=True)
+    _panel(panels[1, 0], rows, "environments", "steps a second", "environments", log=False)
+    _panel(panels[1, 1], rows, "replay", "milliseconds for 256 pairs", "steps held", log=True)
+    save(figure, PICTURE)
+    print(f"{PICTURE} ({DPI} dpi)")
+
+
+def _panel(
+    axes: Axes, rows: list[dict[str, str]], question: str, ylabel: str, xlabel: str, *, log: bool
+) -> None:
+    style(axes, ylabel)
+    mine = [row for row in rows if row["question"] == question]
+    by_side: dict[str, list[dict[str, str]]] = {}
+    for row in mine:
+        by_side.setdefault(row["side"], []).append(row)
+    for (side, points), colour in zip(by_side.items(), (BLUE, VERMILION, GREEN), strict=False):
+        x, middle, low, high = (
+            np.array([float(row[key]) for row in points]) for key in ("x", "median", "low", "high")
+        )
+        axes.errorbar(
+            x,
+            middle,
+            yerr=[middle - low, high - middle],
+            color=colour,
+            marker="o",
+            ms=4,
+            lw=1.5,
+            elinewidth=0.8,
+            capsize=2,
+            label=side,
+        )
+    if log:
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+    ticks = sorted({int(row["x"]) for row in mine})
+    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_major_formatter(FixedFormatter([f"{tick:,}" for tick in ticks]))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(xlabel, color=MUTED)
+    if not log:
+        axes.set_ylim(bottom=0)
+    axes.legend(frameon=False, fontsize=8, labelcolor=MUTED)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import torch
 
 from merl.resources import keep_freed_memory
-from merl.training.run import machine, package_versions
+from merl.training.machine import machine, package_versions
 
 Work = Callable[[], object]
 

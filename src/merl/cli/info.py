@@ -14,8 +14,8 @@ from merl.cli.parsing import parse
 from merl.core import MerlError
 from merl.experiments.presets import compose
 from merl.resources import available_memory, free_disk
+from merl.training.machine import machine, package_versions
 from merl.training.parts import Parts
-from merl.training.run import machine, package_versions
 
 TASK = "reach_duplo"
 FEATURES = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")

@@ -16,21 +16,15 @@ import fcntl
 import itertools
 import json
 import os
-import platform
 import re
 import shutil
-import subprocess
-import types
-import typing
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
 
 import merl
@@ -38,11 +32,11 @@ from merl.agents import AGENTS
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
 from merl.envs.own import module_folder, search_first
 from merl.training.config import TrainConfig
+from merl.training.machine import commit, machine, package_versions
+from merl.training.plain import box, describe, from_plain, to_plain, told
 
 LOCK_FILE = "lock"
 FORMAT = 1
-PACKAGES = ("torch", "numpy", "gymnasium", "dm_control", "mujoco", "mujoco-warp", "warp-lang")
-T = TypeVar("T")
 Bounds = tuple[list[float], list[float]]
 """Of an environment's own actions: lower, upper."""
 
@@ -85,10 +79,10 @@ class Run:
             "seed": config.seed,
             "config": to_plain(config),
             "module_folder": _module_folder(config.task),
-            "observation_space": {key: _describe(s) for key, s in observation_space.items()},
-            "action_space": _describe(action_space) | {"own_bounds": bounds},
+            "observation_space": {key: describe(s) for key, s in observation_space.items()},
+            "action_space": describe(action_space) | {"own_bounds": bounds},
             "versions": package_versions(),
-            "commit": _commit(),
+            "commit": commit(),
             "machine": machine(),
         }
         try:
@@ -133,7 +127,7 @@ class Run:
                 "step": step,
                 "merl": merl.__version__,
                 "versions": package_versions(),
-                "commit": _commit(),
+                "commit": commit(),
                 "machine": machine(),
             }
         )
@@ -148,11 +142,11 @@ class Run:
             MerlError: naming what differs.
         """
         record = _read(self.path)
-        before = {f"observation {k!r}": _told(s) for k, s in record["observation_space"].items()}
-        now = {f"observation {k!r}": _told(_describe(s)) for k, s in observation_space.items()}
+        before = {f"observation {k!r}": told(s) for k, s in record["observation_space"].items()}
+        now = {f"observation {k!r}": told(describe(s)) for k, s in observation_space.items()}
         before["action"], now["action"] = (
-            _told(record["action_space"]),
-            _told(_describe(action_space)),
+            told(record["action_space"]),
+            told(describe(action_space)),
         )
         own = record["action_space"].get("own_bounds")
         if own is not None and bounds is not None:
@@ -289,56 +283,11 @@ def _exists(path: Path) -> bool:
         raise MerlError(f"run folder {path} cannot be used: {error.strerror}") from None
 
 
-def to_plain(config: Any) -> dict[str, Any]:
-    """A config as JSON knows it."""
-    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config), default=str))
-    return plain
-
-
 def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
     """A run's config; that of its agent is of the kind that the agent's name says."""
     name = plain.get("agent_name", "merl")
     check_choice("agent", name, tuple(AGENTS))
     return from_plain(TrainConfig, plain, agent=type(AGENTS[name]))
-
-
-def from_plain(cls: type[T], plain: Mapping[str, Any], **narrower: type) -> T:
-    """The config that `to_plain` took apart; fields that are not there keep their defaults.
-
-    Args:
-        cls: the dataclass.
-        plain: its values.
-        **narrower: the type of a field that is annotated with a base of it.
-
-    Raises:
-        TypeError: a value is not of its field's type.
-    """
-    hints = typing.get_type_hints(cls) | narrower
-    known = {
-        name: _restore(name, hints[name], value) for name, value in plain.items() if name in hints
-    }
-    return cls(**known)
-
-
-def _restore(name: str, hint: Any, value: Any) -> Any:
-    if isinstance(hint, types.UnionType):
-        if value is None:
-            return None
-        hint = next(option for option in typing.get_args(hint) if option is not types.NoneType)
-    if dataclasses.is_dataclass(hint) and isinstance(value, dict):
-        return from_plain(typing.cast(type[Any], hint), value)
-    origin = typing.get_origin(hint) or hint
-    if origin is tuple and isinstance(value, list):
-        of = typing.get_args(hint)[0]
-        return tuple(_restore(name, of, part) for part in value)
-    if origin is Path and isinstance(value, str):
-        return Path(value)
-    plain: dict[Any, tuple[type, ...]] = {float: (int, float), typing.Literal: (str,)}
-    if not isinstance(value, plain.get(origin, (origin,))) or (
-        isinstance(value, bool) and origin is not bool
-    ):
-        raise TypeError(f"{name} is {value!r}")
-    return value
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -370,78 +319,13 @@ def _last_machine(record: Mapping[str, Any]) -> dict[str, Any]:
     return recorded
 
 
-def package_versions() -> dict[str, str]:
-    """The versions of what a result depends on."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "missing"
-    return found
-
-
-def machine() -> dict[str, Any]:
-    """What it runs on."""
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    return {
-        "processor": processor_name(),
-        "cores": len(os.sched_getaffinity(0)),
-        "instructions": torch.backends.cpu.get_cpu_capability(),
-        "gpu": gpu,
-    }
-
-
-def processor_name() -> str:
-    """The processor's own name, where the system tells it."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def _commit() -> str | None:
-    """The commit of the source, where it runs from a checkout."""
-    source = Path(merl.__file__).parent
-    command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip() or None
-
-
 def _recorded_spaces(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box]:
     observation: dict[str, spaces.Space[Any]] = {
-        key: _box(described) for key, described in record["observation_space"].items()
+        key: box(described) for key, described in record["observation_space"].items()
     }
-    return spaces.Dict(observation), _box(record["action_space"])
+    return spaces.Dict(observation), box(record["action_space"])
 
 
 def _module_folder(task: str) -> str | None:
     folder = module_folder(task)
     return None if folder is None else str(folder)
-
-
-def _told(described: Mapping[str, Any]) -> str:
-    return f"{described['dtype']} {tuple(described['shape'])}"
-
-
-def _describe(space: spaces.Space[Any]) -> dict[str, Any]:
-    """Shape, type and bounds; JSON knows no infinity, so a box without bounds has none."""
-    assert isinstance(space, spaces.Box)
-    bounds = (float(space.low.min()), float(space.high.max()))
-    return {
-        "shape": list(space.shape),
-        "dtype": str(space.dtype),
-        "bounds": bounds if np.isfinite(bounds).all() else None,
-    }
-
-
-def _box(described: Mapping[str, Any]) -> spaces.Box:
-    dtype: Any = np.dtype(described["dtype"]).type
-    low, high = described["bounds"] or (-np.inf, np.inf)
-    return spaces.Box(low, high, tuple(described["shape"]), dtype)

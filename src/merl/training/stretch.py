@@ -18,8 +18,9 @@ from merl.training.loop import Moment, Progress, Stage, train
 from merl.training.meters import Averages, Clock, Interval
 from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
+from merl.training.plain import to_plain
 from merl.training.rollout import FrameStack, mean_metrics
-from merl.training.run import Run, to_plain
+from merl.training.run import Run
 from merl.training.signals import Interrupt
 from merl.training.updating import make_update
 

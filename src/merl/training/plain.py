@@ -1,0 +1,84 @@
+"""Configs and spaces as JSON knows them, and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from gymnasium import spaces
+
+T = TypeVar("T")
+
+
+def to_plain(config: Any) -> dict[str, Any]:
+    """A config as JSON knows it."""
+    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    return plain
+
+
+def from_plain(cls: type[T], plain: Mapping[str, Any], **narrower: type) -> T:
+    """The config that `to_plain` took apart; fields that are not there keep their defaults.
+
+    Args:
+        cls: the dataclass.
+        plain: its values.
+        **narrower: the type of a field that is annotated with a base of it.
+
+    Raises:
+        TypeError: a value is not of its field's type.
+    """
+    hints = typing.get_type_hints(cls) | narrower
+    known = {
+        name: _restore(name, hints[name], value) for name, value in plain.items() if name in hints
+    }
+    return cls(**known)
+
+
+def _restore(name: str, hint: Any, value: Any) -> Any:
+    if isinstance(hint, types.UnionType):
+        if value is None:
+            return None
+        hint = next(option for option in typing.get_args(hint) if option is not types.NoneType)
+    if dataclasses.is_dataclass(hint) and isinstance(value, dict):
+        return from_plain(typing.cast(type[Any], hint), value)
+    origin = typing.get_origin(hint) or hint
+    if origin is tuple and isinstance(value, list):
+        of = typing.get_args(hint)[0]
+        return tuple(_restore(name, of, part) for part in value)
+    if origin is Path and isinstance(value, str):
+        return Path(value)
+    plain: dict[Any, tuple[type, ...]] = {float: (int, float), typing.Literal: (str,)}
+    if not isinstance(value, plain.get(origin, (origin,))) or (
+        isinstance(value, bool) and origin is not bool
+    ):
+        raise TypeError(f"{name} is {value!r}")
+    return value
+
+
+def told(described: Mapping[str, Any]) -> str:
+    """A described box in a few words."""
+    return f"{described['dtype']} {tuple(described['shape'])}"
+
+
+def describe(space: spaces.Space[Any]) -> dict[str, Any]:
+    """Shape, type and bounds; JSON knows no infinity, so a box without bounds has none."""
+    assert isinstance(space, spaces.Box)
+    bounds = (float(space.low.min()), float(space.high.max()))
+    return {
+        "shape": list(space.shape),
+        "dtype": str(space.dtype),
+        "bounds": bounds if np.isfinite(bounds).all() else None,
+    }
+
+
+def box(described: Mapping[str, Any]) -> spaces.Box:
+    """The box that was described."""
+    dtype: Any = np.dtype(described["dtype"]).type
+    low, high = described["bounds"] or (-np.inf, np.inf)
+    return spaces.Box(low, high, tuple(described["shape"]), dtype)

@@ -18,7 +18,7 @@ from merl.statistics import bootstrap_interval, wilson_interval
 DOCS = Path(__file__).parent
 DATA, IMAGES = DOCS / "data", DOCS / "images"
 AGENTS = DATA / "agents"
-MOST = {"state": 100_000, "laptop": 40_000}
+MOST = {"state": 100_000, "laptop": 100_000}
 """Steps that the agents are compared over."""
 SENSES = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", "proprio")}
 

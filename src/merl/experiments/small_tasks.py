@@ -92,7 +92,7 @@ def learn(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> Eval
     """Train, and evaluate over 20 episodes without noise; all evaluations are in its metrics."""
     config = small_config(case, seed=seed, run_dir=run_dir, evaluations=evaluations)
     with Parts.prepare(config, new=True) as parts:
-        outcome = trainer.start(parts, _Silent())
+        outcome = trainer.start(parts, Silent())
     assert outcome.evaluation is not None
     return outcome.evaluation
 
@@ -117,23 +117,23 @@ def optimum(task: str) -> float:
     return float(np.mean(returns_of(lambda env: env.best_action(), task)))
 
 
-class _Silent:
+class Silent:
     """Watches and says nothing."""
 
     def begin(self, run: Run, step: int) -> None:
-        pass
+        """See `stretch.View`."""
 
     def moment(self, moment: Moment, metrics: dict[str, float]) -> None:
-        pass
+        """See `stretch.View`."""
 
     def evaluating(self, episode: int, total: int) -> None:
-        pass
+        """See `stretch.View`."""
 
     def evaluated(self, step: int, evaluation: Evaluation) -> None:
-        pass
+        """See `stretch.View`."""
 
     def saved(self, step: int) -> None:
-        pass
+        """See `stretch.View`."""
 
     def warn(self, message: str) -> None:
-        pass
+        """See `stretch.View`."""

@@ -1,0 +1,62 @@
+"""What saving costs: python docs/measure_saving.py [--preset paper --task move_box].
+
+A run that saves at every episode's end, with the networks and the pictures of its preset, and how
+long a save takes; at the default `--save-every` of 300 seconds, what share of the time that is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import tyro
+
+from merl.experiments.presets import compose
+from merl.experiments.small_tasks import Silent
+from merl.training import trainer
+from merl.training.parts import Parts
+from merl.training.stretch import Stretch
+
+
+def main(preset: str = "laptop", task: str = "reach_duplo", steps: int = 3000) -> None:
+    """Train for so many steps, an update for every fiftieth, and print what a save took."""
+    taken: list[float] = []
+    save = Stretch._save
+
+    def timed(stretch: Stretch) -> bool:
+        begun = time.perf_counter()
+        done = save(stretch)
+        taken.append(time.perf_counter() - begun)
+        return done
+
+    Stretch._save = timed  # type: ignore[method-assign]
+    with tempfile.TemporaryDirectory(dir=".") as folder:
+        config = dataclasses.replace(
+            compose(preset, task),
+            steps=steps,
+            run_dir=Path(folder) / "run",
+            save_every=0.0,
+            seed_steps=100,
+            updates_per_step=0.02,
+            threads=1,
+        )
+        config = dataclasses.replace(
+            config, eval=dataclasses.replace(config.eval, every=steps, episodes=2, video="none")
+        )
+        with Parts.prepare(config, new=True) as parts:
+            trainer.start(parts, Silent())
+        newest = max((config.run_dir / "checkpoints").iterdir()) if config.run_dir else Path()
+        size = sum(file.stat().st_size for file in newest.iterdir())
+    every = compose(preset, task).save_every
+    print(
+        f"{preset}, {task}: {len(taken)} saves of {size / 1e6:.0f} MB and 250 steps, median "
+        f"{median(taken):.2f} s, most {max(taken):.2f} s: {100 * median(taken) / every:.2f} % of "
+        f"{every:g} s"
+    )
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import multiprocessing
 import os
 import re
 from collections.abc import Iterator
@@ -56,14 +57,20 @@ def keep_freed_memory(keep: bool = True) -> bool:
 
 
 def allow_picture_threads(count: int | None) -> None:
-    """Let a picture be drawn by so many threads of this process; None: one for each core."""
+    """Let a picture be drawn by so many threads of this process.
+
+    Args:
+        count: None for one for each core, or a single one in a process that another has started,
+            as those of vectorized environments are.
+    """
     global _allowed_threads
     _allowed_threads = count
 
 
 def picture_threads() -> int:
     """How many threads may draw a picture, `MOST_PICTURE_THREADS` at most."""
-    allowed = _allowed_threads or len(os.sched_getaffinity(0))
+    is_child = multiprocessing.parent_process() is not None
+    allowed = _allowed_threads or (1 if is_child else len(os.sched_getaffinity(0)))
     return max(1, min(allowed, MOST_PICTURE_THREADS))
 
 

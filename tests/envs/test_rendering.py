@@ -177,6 +177,34 @@ def test_any_number_of_threads_draws_the_same_picture(task):
     assert np.ptp(alone) > 0
 
 
+def test_a_process_that_is_forked_after_a_picture_takes_pictures_too(warp_env):
+    done = run(
+        """
+        import multiprocessing
+        from merl.envs import make_env
+        from merl.resources import allow_picture_threads, picture_threads
+
+        env = make_env("reach_duplo", renderer="warp", image_size=16)
+
+        def look(results):
+            results.put((picture_threads(), env.reset(seed=0)[0]["image"]))
+
+        allow_picture_threads(2)
+        here = env.reset(seed=0)[0]["image"]
+        fork = multiprocessing.get_context("fork")
+        for allowed, threads in ((2, 2), (None, 1)):
+            allow_picture_threads(allowed)
+            results = fork.Queue()
+            child = fork.Process(target=look, args=(results,))
+            child.start()
+            there = results.get(timeout=30)
+            child.join()
+            print(there[0] == threads and (there[1] == here).all())
+        """
+    )
+    assert (done.stdout.split(), done.returncode) == (["True", "True"], 0), done.stderr
+
+
 @pytest.mark.parametrize("size", [16, 700])
 @pytest.mark.parametrize("renderer", ["warp", "gl"])
 def test_any_size(renderer, size, request):

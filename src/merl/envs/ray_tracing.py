@@ -102,6 +102,9 @@ def _helpers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(MOST_PICTURE_THREADS, thread_name_prefix="merl-rays")
 
 
+os.register_at_fork(after_in_child=lambda: _helpers.cache_clear())  # threads are not inherited
+
+
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
 """What moves from one picture to the next."""
 _COMPILER_FLAGS = "-menable-no-nans -fno-signed-zeros -Wno-nan-infinity-disabled"

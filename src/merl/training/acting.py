@@ -23,7 +23,6 @@ from gymnasium.vector.async_vector_env import AsyncState
 from numpy.typing import NDArray
 
 from merl.core import EnvironmentsLost, MerlError, Observation
-from merl.resources import allow_picture_threads
 from merl.training.config import TrainConfig
 from merl.training.environment import environment_state, make_run_env, set_environment_state
 
@@ -361,7 +360,6 @@ class _Maker:
             return _Lent(self.here)
         for number in _LEFT_TO_THE_RUN:
             signal.signal(number, signal.SIG_IGN)
-        allow_picture_threads(1)
         with _errors_that_arrive():
             return _Worker(make_run_env(self.config), self.index)
 

@@ -83,13 +83,13 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
         plain = plain.to(device)
         sides[reference] = repeated(partial(plain.update, sample))
         for precision in ("fp32", "bf16"):
-            name, learner = f"{ours}, {precision}", _learner(agent, precision, device)
+            name, learner = f"{ours}, {precision}", learner_of(agent, precision, device)
             sides[name] = repeated(partial(learner.update, batch))
             of[name] = reference
             if replay is not None:
                 name += WHOLE
                 update = UpdateOnDevice(
-                    _learner(agent, precision, device), replay, batch_size, seed=0
+                    learner_of(agent, precision, device), replay, batch_size, seed=0
                 )
                 for _ in range(UpdateOnDevice.WARM_UP):
                     update()
@@ -164,7 +164,8 @@ def as_sample(batch: Batch, *, vector: bool) -> Sample:
     )
 
 
-def _learner(agent: str, precision: Literal["fp32", "bf16"], device: torch.device) -> DDPG:
+def learner_of(agent: str, precision: Literal["fp32", "bf16"], device: torch.device) -> DDPG:
+    """Ours, in the size that is timed."""
     config = dataclasses.replace(AGENTS[agent], precision=precision)
     if agent == "merl":
         config = dataclasses.replace(config, head_layers=LAYERS)

@@ -1,0 +1,118 @@
+"""What each thing that makes an update fast gains: python docs/measure_gains.py.
+
+The update of `merl bench update` (six layers, 84x84, batch 256), as it is and with one thing taken
+back at a time, in turns. One thread and processor time, for what else the machine does is not to
+count; medians.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from statistics import median
+from typing import Any, Literal
+from unittest.mock import patch
+
+import torch
+import tyro
+from torch import Tensor
+
+from merl.agents import ddpg
+from merl.agents.ddpg import DDPG
+from merl.bench.measuring import circumstances
+from merl.bench.update import learner_of, noise_batch
+from merl.networks import augmentation, encoders, representation
+from merl.resources import keep_freed_memory
+
+Change = Callable[[DDPG], AbstractContextManager[Any]]
+
+
+def main(precision: Literal["bf16", "fp32"] = "bf16", repeats: int = 5) -> None:
+    """Take each thing back, and print what an update then takes."""
+    torch.set_num_threads(1)
+    print(circumstances())
+    batch = noise_batch(256)
+    changes: dict[str, Change] = {
+        "as it is": lambda _: nullcontext(),
+        "freed memory given back to the system": lambda _: given_back(),
+        "the shift by one gather": lambda _: patch.object(
+            representation, "shift", augmentation._shift_by_index
+        ),
+        "pixels scaled one by one": lambda _: patch.object(
+            encoders.ConvEncoder, "forward", scale_pixels
+        ),
+        "channels first": channels_first,
+        "gradients of all weights": lambda _: patch.object(ddpg, "step_optimizer", step_all),
+        "Adam weight by weight": weight_by_weight,
+    }
+    agents = {name: learner_of("merl", precision, torch.device("cpu")) for name in changes}
+    taken: dict[str, list[float]] = {name: [] for name in changes}
+    with ExitStack() as stack:
+        keep_freed_memory()
+        stack.callback(keep_freed_memory, False)
+        for _ in range(repeats):
+            for name, change in changes.items():
+                with change(agents[name]):
+                    agents[name].update(batch)
+                    begun = time.process_time()
+                    agents[name].update(batch)
+                    taken[name].append(time.process_time() - begun)
+    whole = median(taken["as it is"])
+    for name, seconds in taken.items():
+        print(f"| {name} | {1e3 * median(seconds):,.0f} ms | {median(seconds) / whole - 1:+.1%} |")
+
+
+@contextmanager
+def given_back() -> Iterator[None]:
+    """As glibc does by itself."""
+    keep_freed_memory(False)
+    try:
+        yield
+    finally:
+        keep_freed_memory()
+
+
+@contextmanager
+def channels_first(agent: DDPG) -> Iterator[None]:
+    """Weights and pictures in torch's own order."""
+    agent.networks.encoders.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    as_input = augmentation.to_input
+
+    def contiguous(images: Tensor, dtype: torch.dtype) -> Tensor:
+        return as_input(images, dtype).contiguous()
+
+    with patch.object(encoders, "to_input", contiguous):
+        yield
+
+
+def scale_pixels(encoder: encoders.ConvEncoder, stacks: Tensor) -> Tensor:
+    """X / 255 - 0.5 in fp32, and through the layers as they are."""
+    whole = augmentation.to_input(stacks, torch.float32)
+    scaled = whole.add_(128).mul_(1 / 255).sub_(0.5)
+    maps: Tensor = encoder.convolutions(scaled)
+    return maps.permute(0, 2, 3, 1).flatten(1)
+
+
+def step_all(optimizer: torch.optim.Optimizer, loss: Tensor, _: Any) -> None:
+    """The usual three lines, which also give the critic gradients of the actor's loss."""
+    optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    optimizer.step()
+
+
+@contextmanager
+def weight_by_weight(agent: DDPG) -> Iterator[None]:
+    """Adam as torch.optim takes it by default on a CPU."""
+    groups = [g for o in (agent.critic_optimizer, agent.actor_optimizer) for g in o.param_groups]
+    for group in groups:
+        group["fused"] = None
+    try:
+        yield
+    finally:
+        for group in groups:
+            group["fused"] = True
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -11,6 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 from statistics import median
+from unittest.mock import patch
 
 import tyro
 
@@ -32,8 +33,7 @@ def main(preset: str = "laptop", task: str = "reach_duplo", steps: int = 3000) -
         taken.append(time.perf_counter() - begun)
         return done
 
-    Stretch._save = timed  # type: ignore[method-assign]
-    with tempfile.TemporaryDirectory(dir=".") as folder:
+    with patch.object(Stretch, "_save", timed), tempfile.TemporaryDirectory(dir=".") as folder:
         config = dataclasses.replace(
             compose(preset, task),
             steps=steps,

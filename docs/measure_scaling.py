@@ -21,7 +21,13 @@ import torch
 import tyro
 from gymnasium import spaces
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter
+from matplotlib.ticker import (
+    EngFormatter,
+    FixedLocator,
+    LogLocator,
+    NullLocator,
+    StrMethodFormatter,
+)
 
 from merl.agents import AGENTS, make_agent
 from merl.bench.measuring import Work, circumstances, spread, take_turns
@@ -182,16 +188,33 @@ def draw() -> None:
         rows = list(csv.DictReader(file))
     figure = new_figure(6.4)
     panels = figure.subplots(2, 2)
-    _panel(panels[0, 0], rows, "batch", "milliseconds", "samples in a batch, 84x84", log=True)
-    _panel(panels[0, 1], rows, "image", "milliseconds", "pixels a side", log=True)
-    _panel(panels[1, 0], rows, "environments", "steps a second", "environments", log=False)
-    _panel(panels[1, 1], rows, "replay", "milliseconds for 256 pairs", "steps held", log=True)
+    _panel(
+        panels[0, 0],
+        rows,
+        "batch",
+        "milliseconds",
+        "samples in a batch, 84x84",
+        xlog=True,
+        ylog=True,
+    )
+    _panel(panels[0, 1], rows, "image", "milliseconds", "pixels a side", xlog=True, ylog=True)
+    _panel(
+        panels[1, 0], rows, "environments", "steps a second", "environments", xlog=False, ylog=False
+    )
+    _panel(panels[1, 1], rows, "replay", "ms for 256 pairs", "steps held", xlog=True, ylog=False)
     save(figure, PICTURE)
     print(f"{PICTURE} ({DPI} dpi)")
 
 
 def _panel(
-    axes: Axes, rows: list[dict[str, str]], question: str, ylabel: str, xlabel: str, *, log: bool
+    axes: Axes,
+    rows: list[dict[str, str]],
+    question: str,
+    ylabel: str,
+    xlabel: str,
+    *,
+    xlog: bool,
+    ylog: bool,
 ) -> None:
     style(axes, ylabel)
     mine = [row for row in rows if row["question"] == question]
@@ -214,16 +237,20 @@ def _panel(
             capsize=2,
             label=side,
         )
-    if log:
-        axes.set_xscale("log")
-        axes.set_yscale("log")
     ticks = sorted({int(row["x"]) for row in mine})
+    if xlog:
+        axes.set_xscale("log")
     axes.xaxis.set_major_locator(FixedLocator(ticks))
-    axes.xaxis.set_major_formatter(FixedFormatter([f"{tick:,}" for tick in ticks]))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel(xlabel, color=MUTED)
-    if not log:
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_minor_locator(NullLocator())
+    if ylog:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_locator(NullLocator())
+    else:
         axes.set_ylim(bottom=0)
+    axes.set_xlabel(xlabel, color=MUTED)
     axes.legend(frameon=False, fontsize=8, labelcolor=MUTED)
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import logging
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SACConfig
 from merl.core import Batch, MerlError
-from merl.training.checkpoint import Checkpoint, load_agent, save
+from merl.training.checkpoint import Checkpoint, _fingerprint, load_agent, save
 from toy import DotEnv
 
 CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")
@@ -138,6 +139,39 @@ def test_a_checkpoint_of_another_device_loads(tmp_path: Path) -> None:
     load_agent(other, Checkpoint.find(tmp_path))
     assert torch.equal(weights(saved), weights(other))
     assert torch.equal(other.acting.get_state(), twin.acting.get_state())
+
+
+def test_a_checkpoint_that_was_written_on_cuda_goes_on_here(tmp_path: Path) -> None:
+    """Its tensors are told to lie on cuda:0, and its Adam to be one for CUDA graphs."""
+    saved, other = agent(0), agent(1)
+    saved.update(batch_of(saved))
+    for optimizer in (saved.critic_optimizer, saved.actor_optimizer):
+        optimizer.param_groups[0]["capturable"] = True
+    save(tmp_path, 1, saved, {}, score=None, keep=1)
+    folder = tmp_path / "00000001"
+    file = folder / "learner.pt"
+    tell_that_it_lies_on_cuda(file)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"][file.name] = _fingerprint(file)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(RuntimeError, match="CUDA"):
+        torch.load(file, weights_only=True)
+    load_agent(other, Checkpoint.find(tmp_path))
+    assert not other.critic_optimizer.param_groups[0]["capturable"]
+    for optimizer in (saved.critic_optimizer, saved.actor_optimizer):
+        optimizer.param_groups[0]["capturable"] = False
+    for learner in (saved, other):
+        learner.learning.manual_seed(0)
+        learner.update(batch_of(learner))
+    assert torch.equal(weights(saved), weights(other))
+
+
+def tell_that_it_lies_on_cuda(file: Path) -> None:
+    with zipfile.ZipFile(file) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, part in parts.items():
+            archive.writestr(name, part.replace(b"X\x03\0\0\0cpu", b"X\x06\0\0\0cuda:0"))
 
 
 @pytest.mark.parametrize("name", ["weights.safetensors", "learner.pt", "state.json"])

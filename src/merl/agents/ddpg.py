@@ -297,9 +297,13 @@ def step_optimizer(
 def load_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
     """Take back Adam's moments, as copies in the memory order of the weights.
 
-    The fused step walks raw memory: moments in another order would meet the wrong weights.
+    The fused step walks raw memory: moments in another order would meet the wrong weights. Whether
+    it may be part of a CUDA graph is up to the device that it is on, not the one it was saved on.
     """
+    capturable = [group["capturable"] for group in optimizer.param_groups]
     optimizer.load_state_dict(dict(saved))
+    for group, own in zip(optimizer.param_groups, capturable, strict=True):
+        group["capturable"] = own
     for parameter, moments in optimizer.state.items():
         for name in ("exp_avg", "exp_avg_sq"):
             moments[name] = torch.empty_like(parameter).copy_(moments[name])

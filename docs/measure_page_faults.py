@@ -9,12 +9,15 @@ from __future__ import annotations
 import dataclasses
 import resource
 import time
+from functools import partial
 from statistics import median
 
 import torch
 from gymnasium import spaces
 
 from merl.agents import make_agent
+from merl.bench.measuring import Work
+from merl.bench.update import as_sample, noise_batch, reference_of
 from merl.envs import make_env
 from merl.experiments.presets import compose
 from merl.resources import keep_freed_memory
@@ -39,20 +42,27 @@ def main() -> None:
             config.agent, space, actions, frame_stack=3, seed=0, device=torch.device("cpu")
         )
         batch = random_batch(config, space, actions)
-        taken: dict[bool, list[tuple[float, int]]] = {False: [], True: []}
-        for _ in range(ROUNDS):
-            for keep, results in taken.items():
-                keep_freed_memory(keep)
-                agent.update(batch)
-                for _ in range(UPDATES):
-                    faults, begun = _faults(), time.process_time()
-                    agent.update(batch)
-                    results.append((time.process_time() - begun, _faults() - faults))
-        for keep, results in taken.items():
-            seconds, faults = (median(values) for values in zip(*results, strict=True))
-            how = "kept" if keep else "given back"
-            print(f"{preset:8}{how:12}{1e3 * seconds:8.1f} ms{faults:10,.0f} page faults")
+        compare(preset, partial(agent.update, batch))
         env.close()
+    reference, sample = reference_of("merl"), as_sample(noise_batch(256), vector=True)
+    compare("the reference", partial(reference.update, sample))
+
+
+def compare(name: str, update: Work) -> None:
+    """Updates with freed memory given back, and kept."""
+    taken: dict[bool, list[tuple[float, int]]] = {False: [], True: []}
+    for _ in range(ROUNDS):
+        for keep, results in taken.items():
+            keep_freed_memory(keep)
+            update()
+            for _ in range(UPDATES):
+                faults, begun = _faults(), time.process_time()
+                update()
+                results.append((time.process_time() - begun, _faults() - faults))
+    for keep, results in taken.items():
+        seconds, faults = (median(values) for values in zip(*results, strict=True))
+        how = "kept" if keep else "given back"
+        print(f"{name:14}{how:12}{1e3 * seconds:8.1f} ms{faults:10,.0f} page faults")
 
 
 def _faults() -> int:

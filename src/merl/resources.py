@@ -34,8 +34,8 @@ def keep_freed_memory(keep: bool = True) -> bool:
     """Have the C library keep what is freed for the next tensors, in place of giving it back.
 
     An update frees and takes the same large blocks every time. By default glibc maps each of them
-    anew, and the system hands out its pages one by one, zeroed: a fifth of the processor time of an
-    update of preset laptop, a third of one of the paper's size (docs/bench.md).
+    anew, and the system hands out its pages one by one, zeroed: a tenth of the processor time of an
+    update of the paper's size, more where other runs share the machine (docs/bench.md).
 
     Args:
         keep: False for what glibc does by itself once it has met large blocks.

@@ -8,7 +8,6 @@ machine alone. The updates are the paper's (six layers) in bf16, on all cores.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
@@ -29,10 +28,10 @@ from matplotlib.ticker import (
     StrMethodFormatter,
 )
 
-from merl.agents import AGENTS, make_agent
 from merl.bench.measuring import Work, circumstances, spread, take_turns
 from merl.bench.train import steps_per_second
-from merl.core import Batch, Transition
+from merl.bench.update import ACTIONS, learner_of, noise_batch, space_of
+from merl.core import Transition
 from merl.envs import make_env
 from merl.replay import Replay, ReplayConfig
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
@@ -46,7 +45,7 @@ BATCHES = (16, 32, 64, 128, 256, 512)
 SIDES = (32, 48, 64, 84, 100, 128)
 ENVIRONMENTS = (1, 2, 3, 4)
 CAPACITIES = (1000, 10_000, 100_000, 300_000)
-STACK, PROPRIO, ACTIONS, EPISODE = 3, 24, 9, 250
+EPISODE = 250
 ACTION_SPACE = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
 
 Row = tuple[str, str, int, float, float, float]
@@ -112,8 +111,7 @@ def capacities(repeats: int) -> Iterator[Row]:
                     continue
                 config = ReplayConfig(capacity=capacity, compress=compress)
                 place = Path(folder) / f"{capacity}-{compress}"
-                space = _space(84)
-                ring = Replay(config, space, ACTION_SPACE, directory=place)
+                ring = Replay(config, space_of(), ACTION_SPACE, directory=place)
                 _fill(ring, seen, capacity)
                 rng = np.random.default_rng(0)
                 name = "compressed" if compress else "raw"
@@ -132,34 +130,8 @@ def _row(question: str, side: str, x: int, values: list[float]) -> Row:
 
 
 def _update(size: int, side: int) -> Work:
-    config = dataclasses.replace(AGENTS["merl"], head_layers=6, precision="bf16")
-    device = torch.device("cpu")
-    agent = make_agent(config, _space(side), ACTION_SPACE, frame_stack=STACK, seed=0, device=device)
-    return partial(agent.update, _batch(size, side))
-
-
-def _batch(size: int, side: int) -> Batch:
-    generator = torch.Generator().manual_seed(0)
-
-    def observation() -> dict[str, torch.Tensor]:
-        shape = (size, STACK, side, side, 3)
-        return {
-            "image": torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator),
-            "proprio": torch.randn((size, PROPRIO), generator=generator),
-        }
-
-    action = torch.rand((size, ACTIONS), generator=generator) * 2 - 1
-    reward = torch.rand(size, generator=generator)
-    return Batch(observation(), action, reward, torch.full((size,), 0.97), observation())
-
-
-def _space(side: int) -> spaces.Dict:
-    return spaces.Dict(
-        {
-            "image": spaces.Box(0, 255, (side, side, 3), np.uint8),
-            "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO,), np.float32),
-        }
-    )
+    agent = learner_of("merl", "bf16", torch.device("cpu"), side)
+    return partial(agent.update, noise_batch(size, side))
 
 
 def _arm() -> list[dict[str, Any]]:

@@ -164,19 +164,21 @@ def as_sample(batch: Batch, *, vector: bool) -> Sample:
     )
 
 
-def learner_of(agent: str, precision: Literal["fp32", "bf16"], device: torch.device) -> DDPG:
-    """Ours, in the size that is timed."""
+def learner_of(
+    agent: str, precision: Literal["fp32", "bf16"], device: torch.device, side: int = SIDE
+) -> DDPG:
+    """Ours, in the size that is timed, for pictures of `side` pixels squared."""
     config = dataclasses.replace(AGENTS[agent], precision=precision)
     if agent == "merl":
         config = dataclasses.replace(config, head_layers=LAYERS)
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
-    return make_agent(config, _space(), actions, frame_stack=STACK, seed=0, device=device)
+    return make_agent(config, space_of(side), actions, frame_stack=STACK, seed=0, device=device)
 
 
 def _noise(steps: int = 2000) -> Replay:
     """A replay of noise, in episodes of 250 steps."""
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
-    replay = Replay(ReplayConfig(), _space(), actions, capacity=steps)
+    replay = Replay(ReplayConfig(), space_of(), actions, capacity=steps)
     rng = np.random.default_rng(0)
     for step in range(steps):
         seen = {
@@ -190,21 +192,22 @@ def _noise(steps: int = 2000) -> Replay:
     return replay
 
 
-def _space() -> spaces.Dict:
+def space_of(side: int = SIDE) -> spaces.Dict:
+    """What is seen and felt."""
     return spaces.Dict(
         {
-            "image": spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8),
+            "image": spaces.Box(0, 255, (side, side, 3), np.uint8),
             "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO,), np.float32),
         }
     )
 
 
-def noise_batch(size: int) -> Batch:
-    """A batch of noise, always the same."""
+def noise_batch(size: int, side: int = SIDE) -> Batch:
+    """A batch of noise, always the same for the same size."""
     generator = torch.Generator().manual_seed(0)
 
     def observation() -> dict[str, Tensor]:
-        shape = (size, STACK, SIDE, SIDE, 3)
+        shape = (size, STACK, side, side, 3)
         return {
             "image": torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator),
             "proprio": torch.randn((size, PROPRIO), generator=generator),

@@ -130,8 +130,9 @@ def _start_warp() -> Any:
             warp.config.log_level = warp.LOG_ERROR
             cache = _kernel_cache()
             warp.config.kernel_cache_dir = str(cache)
-            flags = warp.config.cpu_compiler_flags or ""
-            warp.config.cpu_compiler_flags = f"{flags} {_COMPILER_FLAGS}"
+            flags = warp.config.cpu_compiler_flags
+            own = "-march=native" if flags is None else flags  # None: for this processor, too
+            warp.config.cpu_compiler_flags = f"{own} {_COMPILER_FLAGS}"
             if not any(cache.glob(f"{warp.__version__}/*megakernel*")):
                 print("merl: compiling the ray tracer, once, for about 15 s", file=sys.stderr)
             with _silent_stderr():  # without an NVIDIA driver Warp says so, past Python

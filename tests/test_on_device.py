@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -94,6 +95,21 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
     assert len(held) == 25
     # A chi-squared of 24 degrees of freedom exceeds 52 once in a thousand.
     assert ((often - 2000.0) ** 2 / 2000.0).sum() < 52
+
+
+def test_a_draw_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a device without values: what asked for one, or lay elsewhere, would raise."""
+    ring, card, rand = make(capacity=20), torch.device("meta"), torch.rand
+    for _ in writing(ring, 0, [Episode(30, "limit")]):
+        pass
+    copy = OnDevice([ring], card)
+    copy.follow()
+    monkeypatch.setattr(torch, "rand", lambda *a, generator, **k: rand(*a, **k))
+    drawn = tensors(copy.sample(5, torch.Generator()))
+    expected = tensors(ring.sample(5, np.random.default_rng(0)))
+    for name, value in drawn.items():
+        assert (value.device, value.dtype) == (card, expected[name].dtype)
+        assert value.shape == expected[name].shape
 
 
 def test_rings_of_several_sizes_are_refused() -> None:

@@ -28,6 +28,7 @@ from torch import Tensor
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
+from merl.networks.critic import TwinCritic
 
 SIZES = {"conv_channels": 8, "hidden_dim": 32, "precision": "fp32"}
 SMALL = MERLConfig(latent_dim=48, **SIZES)
@@ -193,6 +194,16 @@ def single_precision_errors(case: Case, seed: int) -> dict[str, float]:
         "actor_loss": error(metrics["actor_loss"], report.actor_loss),
     }
     return losses | errors(gradients_of(agent), report.gradients)
+
+
+TWINS_AT_ONCE = [case for case in CASES if case.name in ("six-layers", "without-head-norm")]
+
+
+@named_cases(*TWINS_AT_ONCE)
+def test_as_a_gpu_computes_the_twins(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TwinCritic, "at_once", True)
+    check_in_double_precision(case, updates=5)
+    check_single_precision(case)
 
 
 @named_cases(*CASES)

@@ -6,13 +6,14 @@ import pytest
 import torch
 from torch import nn
 
-from merl.networks.heads import Actor, HeadSize, TwinCritic, mlp
+from merl.networks.critic import TwinCritic
+from merl.networks.heads import MLP, Actor, HeadSize
 
 
 @pytest.mark.parametrize("layers", [1, 3, 6])
 @pytest.mark.parametrize("layer_norm", [True, False])
 def test_the_output_layer_is_counted(layers: int, layer_norm: bool) -> None:
-    head = mlp(10, 4, HeadSize(layers, 16, layer_norm))
+    head = MLP(10, 4, HeadSize(layers, 16, layer_norm))
     kinds = [type(m) for m in head.modules()]
     linear = sum(isinstance(m, nn.Linear) for m in head.modules())
     assert linear == layers
@@ -39,3 +40,29 @@ def test_the_twins_are_apart() -> None:
     assert all((a is None) != (b is None) for a, b in zip(one, two, strict=True))
     (by_action,) = torch.autograd.grad(critic(latent, action.requires_grad_())[0].sum(), [action])
     assert by_action.any(dim=0).all()
+
+
+@pytest.mark.parametrize("layers", [1, 4])
+@pytest.mark.parametrize("layer_norm", [True, False])
+def test_the_twins_at_once_are_the_twins_one_by_one(layers: int, layer_norm: bool) -> None:
+    """Values, and gradients of the action and of every weight; in bf16, too."""
+    critic = TwinCritic(10, 4, HeadSize(layers, 32, layer_norm)).double()
+    for parameter in critic.parameters():
+        nn.init.normal_(parameter, 0.0, 0.3)
+    latent, action = torch.randn(50, 10), torch.rand(50, 4, requires_grad=True)
+
+    def values_and_gradients(dtype: torch.dtype, at_once: bool) -> list[torch.Tensor]:
+        critic.at_once = at_once
+        critic.to(torch.float64 if dtype == torch.float64 else torch.float32)
+        sight = latent.to(next(critic.parameters()).dtype)
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+            q1, q2 = critic(sight, action.to(sight.dtype))
+        learns = [action, *critic.parameters()]
+        return [q1, q2, *torch.autograd.grad((q1 * q2).sum(), learns)]
+
+    for dtype, bound in ((torch.float64, 1e-12), (torch.float32, 1e-5), (torch.bfloat16, 1e-5)):
+        one_by_one, at_once = (values_and_gradients(dtype, way) for way in (False, True))
+        for a, b in zip(at_once, one_by_one, strict=True):
+            assert a.shape == b.shape
+            assert a.dtype == b.dtype
+            assert (a - b).norm() <= bound * b.norm()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.replay import Lanes, ReplayConfig
 from merl.replay.on_device import OnDevice
+from merl.training import loop
 from merl.training.acting import Here
 from merl.training.config import TrainConfig
 from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train
-from merl.training.rollout import Episode, FrameStack
+from merl.training.rollout import Episode, Fetched, FrameStack
 from merl.training.updating import UpdateOnDevice, update_from_host
 from toy import DotEnv
 
@@ -45,17 +47,13 @@ class Parts:
         self.update: Update = update_from_host(self.agent, self.replay, self.randomness, config)
         self.stage = Stage(Here(self.env), self.replay, [FrameStack(3, ("image",), CPU)])
 
-    def run(self) -> list[Moment]:
-        return list(
-            train(
-                self.stage,
-                self.agent,
-                self.update,
-                self.progress,
-                self.randomness,
-                self.config,
-            )
+    def moments(self) -> Iterator[Moment]:
+        return train(
+            self.stage, self.agent, self.update, self.progress, self.randomness, self.config
         )
+
+    def run(self) -> list[Moment]:
+        return list(self.moments())
 
     def weights(self) -> torch.Tensor:
         return torch.cat([p.detach().flatten() for p in self.agent.networks.parameters()])
@@ -88,6 +86,37 @@ def test_yields_every_step_and_tells_of_each_episode() -> None:
     assert [m.step for m in moments if m.episodes] == [10, 20, 30, 40, 50, 60]
     assert all(e.length == 10 for m in moments for e in m.episodes)
     assert [m.step for m in moments if m.learning] == list(range(21, 61))
+
+
+@pytest.mark.parametrize("synchronous", [True, False])
+@pytest.mark.parametrize("on_gpu", [True, False])
+def test_a_gpu_is_told_what_to_learn_before_its_actions_are_waited_for(
+    synchronous: bool, on_gpu: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = Parts(dataclasses.replace(CONFIG, synchronous=synchronous))
+    order: list[str] = []
+    update, act = parts.update, parts.stage.act
+    parts.update = lambda: (order.append("learn"), update())[1]
+    parts.stage.act = lambda actions: (order.append("act"), act(actions))[1]  # type: ignore[method-assign, func-returns-value]
+
+    class OnItsWay(Fetched):
+        def __init__(self, tensor: torch.Tensor) -> None:
+            super().__init__(tensor)
+            self.under_way = on_gpu
+
+        def wait(self) -> torch.Tensor:
+            order.append("wait")
+            return self._there
+
+    monkeypatch.setattr(loop, "Fetched", OnItsWay)
+    expected = ["wait", "act", "learn"]
+    if on_gpu and not synchronous:
+        expected = ["learn", "wait", "act"]
+    for moment in parts.moments():
+        if 30 <= moment.step < 60:
+            assert order == expected
+        order.clear()
+    assert moment.updates == 40
 
 
 def test_random_actions_come_first_and_fill_the_box() -> None:

@@ -10,9 +10,10 @@ from torch import Tensor, nn
 
 from merl.agents.config import AgentConfig
 from merl.core import MerlError, is_image, is_vector
+from merl.networks.critic import TwinCritic
 from merl.networks.encoders import ConvEncoder, VectorEncoder
 from merl.networks.fusion import SIMPLEX_GROUP, Concatenation, Fusion
-from merl.networks.heads import Actor, GaussianActor, HeadSize, TwinCritic
+from merl.networks.heads import Actor, GaussianActor, HeadSize
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
 

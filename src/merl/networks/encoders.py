@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from merl.core import MerlError
 from merl.networks.augmentation import to_input
+from merl.networks.precision import compute_dtype
 
 
 class ConvEncoder(nn.Module):
@@ -62,18 +63,11 @@ class ConvEncoder(nn.Module):
         # numbers are multiplied in place of all pixels.
         weight = first.weight / 255.0
         bias = first.bias + first.weight.sum(dim=(1, 2, 3)) / 510.0
-        pixels = to_input(stacks, _precision(first.weight))
+        pixels = to_input(stacks, compute_dtype(first.weight))
         maps = functional.conv2d(pixels, weight, bias, first.stride)  # (B, 32, h, w)
         for layer in others:
             maps = layer(maps)
         return maps.permute(0, 2, 3, 1).flatten(1)  # a view: the memory is channels-last
-
-
-def _precision(weight: Tensor) -> torch.dtype:
-    """What a layer with this weight computes in: the weight's own, or autocast's."""
-    device = weight.device.type
-    enabled = torch.is_autocast_enabled(device)
-    return torch.get_autocast_dtype(device) if enabled else weight.dtype
 
 
 class Standardize(nn.Module):

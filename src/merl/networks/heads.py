@@ -1,4 +1,4 @@
-"""Heads: the actor and the twin critic over a latent (MERL C.1)."""
+"""Heads: MLPs over a latent, and the actors that are made of one (MERL C.1)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 
-class _Hidden(nn.Module):
+class Hidden(nn.Module):
     """Linear, LayerNorm (or none) and ReLU; the norm in the precision of the weights."""
 
     def __init__(self, in_features: int, width: int, layer_norm: bool) -> None:
@@ -18,13 +18,15 @@ class _Hidden(nn.Module):
         self.norm = nn.LayerNorm(width) if layer_norm else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, in_features) to (B, width)."""
         return torch.relu(self.norm(self.linear(x).to(self.linear.weight.dtype)))
 
 
-class _Output(nn.Linear):
+class Output(nn.Linear):
     """The last linear layer, always in the precision of the weights: bf16 would round Q away."""
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, in_features) to (B, out_features)."""
         with torch.autocast(x.device.type, enabled=False):
             return super().forward(x.to(self.weight.dtype))
 
@@ -44,11 +46,25 @@ class HeadSize:
     layer_norm: bool = True
 
 
-def mlp(in_features: int, out_features: int, size: HeadSize) -> nn.Sequential:
-    """An MLP of that shape; ReLU after each layer but the last."""
-    widths = [in_features] + [size.width] * (size.layers - 1)
-    hidden = [_Hidden(a, b, size.layer_norm) for a, b in pairwise(widths)]
-    return nn.Sequential(*hidden, _Output(widths[-1], out_features))
+class MLP(nn.Sequential):
+    """Layers of that shape; ReLU after each but the last."""
+
+    def __init__(self, in_features: int, out_features: int, size: HeadSize) -> None:
+        widths = [in_features] + [size.width] * (size.layers - 1)
+        hidden = [Hidden(a, b, size.layer_norm) for a, b in pairwise(widths)]
+        super().__init__(*hidden, Output(widths[-1], out_features))
+
+    @property
+    def hidden(self) -> list[Hidden]:
+        """All layers but the last."""
+        return [layer for layer in self if isinstance(layer, Hidden)]
+
+    @property
+    def output(self) -> Output:
+        """The last layer."""
+        layer = self[-1]
+        assert isinstance(layer, Output)
+        return layer
 
 
 class Actor(nn.Module):
@@ -56,7 +72,7 @@ class Actor(nn.Module):
 
     def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
         super().__init__()
-        self.layers = mlp(latent_dim, action_dim, size)
+        self.layers = MLP(latent_dim, action_dim, size)
 
     def forward(self, latent: Tensor) -> Tensor:
         """(B, d) to (B, A), in (-1, 1)."""
@@ -74,23 +90,10 @@ class GaussianActor(nn.Module):
 
     def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
         super().__init__()
-        self.layers = mlp(latent_dim, 2 * action_dim, size)
+        self.layers = MLP(latent_dim, 2 * action_dim, size)
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """(B, d) to mu and log sigma, (B, A) each."""
         mean, raw = self.layers(latent).chunk(2, dim=-1)
         log_std = self.LEAST + (self.GREATEST - self.LEAST) * (torch.tanh(raw) + 1) / 2
         return mean, log_std
-
-
-class TwinCritic(nn.Module):
-    """Q_phi1 and Q_phi2, two heads of their own over one latent (clipped double Q, TD3)."""
-
-    def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
-        super().__init__()
-        self.q1, self.q2 = (mlp(latent_dim + action_dim, 1, size) for _ in range(2))
-
-    def forward(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Latent (B, d) and action (B, A) to the two values, (B,) each."""
-        both = torch.cat([latent, action], dim=-1)
-        return self.q1(both).squeeze(-1), self.q2(both).squeeze(-1)

@@ -20,7 +20,7 @@ from merl.replay import Lanes
 from merl.training.acting import Environments, Lost
 from merl.training.config import TrainConfig
 from merl.training.guards import check_moment
-from merl.training.rollout import Episode, FrameStack, side_by_side
+from merl.training.rollout import Episode, Fetched, FrameStack, side_by_side
 
 
 @dataclass
@@ -126,8 +126,14 @@ def train(
         learning: dict[str, Tensor] = {}
         try:
             stage.begin_episodes(randomness, progress)
-            stage.act(_actions(stage, agent, progress, randomness, config))
-            if not config.synchronous:  # while the environments step
+            actions = _actions(stage, agent, progress, randomness, config)
+            # Beside the environments the learner learns while they step. A GPU is told what to
+            # learn before its actions are waited for, lest it stand idle until they have arrived.
+            told = actions.under_way and not config.synchronous
+            if told:
+                learning = _learn(update, progress, config)
+            stage.act(actions.wait().numpy())
+            if not (told or config.synchronous):
                 learning = _learn(update, progress, config)
             ended = stage.remember(progress, config.action_repeat)
         except Lost as lost:
@@ -217,14 +223,13 @@ class Stage:
 
 def _actions(
     stage: Stage, agent: Agent, progress: Progress, randomness: Randomness, config: TrainConfig
-) -> NDArray[np.float32]:
+) -> Fetched:
     """Uniformly random at first, then the agent's: (count, A) in [-1, 1]."""
     if progress.step < config.random_steps:
         shape = (stage.count, *stage.environments.action_shape)
-        return randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
-    actions = agent.act(side_by_side(stage.stacks), explore=True)
-    chosen: NDArray[np.float32] = actions.to("cpu", torch.float32).numpy()
-    return chosen
+        drawn = randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
+        return Fetched(torch.from_numpy(drawn))
+    return Fetched(agent.act(side_by_side(stage.stacks), explore=True).float())
 
 
 def _learn(update: Update, progress: Progress, config: TrainConfig) -> dict[str, Tensor]:

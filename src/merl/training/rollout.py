@@ -25,7 +25,7 @@ class FrameStack:
     def __init__(self, frames: int, images: tuple[str, ...], device: torch.device) -> None:
         self._frames = {key: deque[NDArray[Any]](maxlen=frames) for key in images}
         self._length = frames
-        self._device = device
+        self.device = device
         self._vectors: dict[str, NDArray[Any]] = {}
 
     def reset(self, observation: Observation) -> None:
@@ -42,15 +42,54 @@ class FrameStack:
 
     def observation(self) -> dict[str, torch.Tensor]:
         """A batch of one: images uint8 (1, K, H, W, C), vectors (1, n)."""
-        stacked = {key: np.stack(frames)[None] for key, frames in self._frames.items()}
-        stacked |= {key: vector[None] for key, vector in self._vectors.items()}
-        return {key: torch.from_numpy(v).to(self._device) for key, v in stacked.items()}
+        return side_by_side([self])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The same on the host, without the batch."""
+        return {key: np.stack(frames) for key, frames in self._frames.items()} | self._vectors
 
 
 def side_by_side(stacks: Sequence[FrameStack]) -> dict[str, torch.Tensor]:
-    """What several see, as one batch (N, ...)."""
-    seen = [stack.observation() for stack in stacks]
-    return seen[0] if len(seen) == 1 else {k: torch.cat([s[k] for s in seen]) for k in seen[0]}
+    """What several see, as one batch (N, ...) on their device."""
+    device = stacks[0].device
+    seen = [stack.arrays() for stack in stacks]
+    return {
+        key: bring(torch.from_numpy(np.stack([arrays[key] for arrays in seen])), device)
+        for key in seen[0]
+    }
+
+
+def bring(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """To the device, without waiting for what a GPU is at: that takes pinned memory."""
+    if device.type == "cuda":
+        tensor = tensor.pin_memory()
+    return tensor.to(device, non_blocking=True)
+
+
+class Fetched:
+    """A tensor on its way to the host.
+
+    Who waits for it waits for nothing that a GPU is given afterwards.
+
+    Attributes:
+        under_way: a GPU has yet to compute it.
+    """
+
+    def __init__(self, tensor: torch.Tensor) -> None:
+        self.under_way = tensor.is_cuda
+        self._there = tensor
+        if self.under_way:
+            self._there = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+            self._there.copy_(tensor, non_blocking=True)
+            self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            self._done.record()
+
+    def wait(self) -> torch.Tensor:
+        """It, once it is there."""
+        if self.under_way:
+            self._done.synchronize()
+            self.under_way = False
+        return self._there
 
 
 @dataclass

@@ -206,6 +206,16 @@ def test_as_a_gpu_computes_the_twins(case: Case, monkeypatch: pytest.MonkeyPatch
     check_single_precision(case)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("at_once", [False, True])
+def test_compiled(at_once: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes a minute, and a C++ compiler."""
+    case = replace(CASES[0], config=replace(SMALL, compile=True))
+    monkeypatch.setattr(TwinCritic, "at_once", at_once)
+    check_in_double_precision(case, updates=5)
+    assert case.agent().networks.critic._compiled_call_impl is not None
+
+
 @named_cases(*CASES)
 def test_bf16(case: Case) -> None:
     """Losses to 1 %; every network's gradient points where the true one does, cosine above 0.9.

@@ -72,6 +72,9 @@ class AgentConfig:
     precision: Precision = "auto"
     """Arithmetic of the update: fp32, bf16 (weights, norms, targets and losses stay fp32), or auto,
     which times both once."""
+    compile: bool = False
+    """Have torch compile what updates compute: a minute before the first one, and a C++ compiler or
+    Triton; to be tried on a GPU (docs/bench.md)."""
 
     def __post_init__(self) -> None:
         if not 0 < self.learning_rate < math.inf:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,6 +89,8 @@ class DDPG:
         self.actor_parameters = [*self._actors_fusion(), *networks.actor.parameters()]
         self.critic_optimizer = self._adam(self.critic_parameters)
         self.actor_optimizer = self._adam(self.actor_parameters)
+        if config.compile:
+            self._compile()
         words = np.random.SeedSequence(seed).generate_state(2)
         self.acting, self.learning = (
             torch.Generator(device).manual_seed(int(word)) for word in words
@@ -112,7 +114,7 @@ class DDPG:
         Returns:
             Actions (B, A), in [-1, 1].
         """
-        mean: Tensor = self.networks.actor(self._actor_latent(observation))
+        mean: Tensor = self._policy(observation)
         if not explore:
             return mean
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
@@ -190,7 +192,8 @@ class DDPG:
         """min_k Q_phi_k(o_t, a), (B,), as a function of the action alone."""
         with torch.no_grad():
             latent = self.networks.critic_fusion(encoded)
-        q1, q2 = self.networks.critic(latent, action)
+        with frozen(self.networks.critic):
+            q1, q2 = self.networks.critic(latent, action)
         return torch.minimum(q1, q2)
 
     @torch.no_grad()
@@ -248,11 +251,14 @@ class DDPG:
 
     # ----------------------------------------------------------------------------------------
 
-    def _actor_latent(self, observation: Mapping[str, Tensor]) -> Tensor:
-        """Of what the actor senses; what only the critic is told may be absent."""
+    def _policy(self, observation: Mapping[str, Tensor]) -> Any:
+        """What the actor makes of what it senses; what only the critic is told may be absent."""
         networks = self.networks
         sensed = {key: observation[key] for key in networks.senses}
-        return networks.actor_latent(networks.encoders(sensed))
+        # As it is written: batches of acting come in sizes that would each have to be compiled.
+        eager = torch.compiler.set_stance("force_eager") if self.config.compile else nullcontext()
+        with eager:
+            return networks.actor(networks.actor_latent(networks.encoders(sensed)))
 
     def _actors_fusion(self) -> Iterator[nn.Parameter]:
         """The fusion that the actor's loss moves: its own, or by name the critic's too."""
@@ -274,6 +280,17 @@ class DDPG:
             parts["critic_fusion"] = self.networks.critic_fusion
         return parts
 
+    def _compile(self) -> None:
+        """Have torch compile what is called in updates."""
+        networks = self.networks
+        parts: list[nn.Module] = [networks.critic_fusion, networks.critic, networks.actor]
+        parts += [] if networks.actor_fusion is None else [networks.actor_fusion]
+        parts += self.critic_target.values()
+        if self.device.type == "cuda":  # on a CPU convolutions are no faster for it
+            parts += networks.encoders.images.values()
+        for part in parts:
+            part.compile(dynamic=False)
+
     def _arithmetic(self) -> AbstractContextManager[Any]:
         """Autocast to bf16 where that was chosen."""
         enabled = self.config.precision == "bf16"
@@ -292,6 +309,19 @@ def step_optimizer(
     optimizer.zero_grad()
     torch.autograd.backward(loss, inputs=parameters)
     optimizer.step()
+
+
+@contextmanager
+def frozen(module: nn.Module) -> Iterator[None]:
+    """No gradient of the module's weights: compiled code would take it, asked for or not."""
+    weights = [weight for weight in module.parameters() if weight.requires_grad]
+    for weight in weights:
+        weight.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for weight in weights:
+            weight.requires_grad_(True)
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:

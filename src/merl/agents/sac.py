@@ -76,7 +76,7 @@ class SAC(DDPG):
     @torch.inference_mode()
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
         """tanh(u), u ~ N(mu, sigma^2) when exploring, else tanh(mu); see `DDPG.act`."""
-        mean, log_std = self.networks.actor(self._actor_latent(observation))
+        mean, log_std = self._policy(observation)
         if not explore:
             return torch.tanh(mean)
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)

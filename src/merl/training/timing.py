@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
-from merl.core import Batch, is_image
+from merl.core import Batch, MerlError, is_image
 from merl.resources import allow_picture_threads
 from merl.training.config import TrainConfig
 
@@ -163,7 +163,15 @@ def _time_update(agent: DDPG, batch: Batch) -> float:
     def update() -> None:
         float(agent.update(batch)["critic_loss"])  # reading it waits for the device
 
-    update()  # the first one also sets up what the others use
+    try:
+        update()  # the first one also sets up what the others use
+    except Exception as error:
+        if not agent.config.compile:
+            raise
+        reason = str(error).strip().splitlines()[0]
+        raise MerlError(
+            f"--agent.compile: torch cannot compile the networks here ({reason}): leave it out"
+        ) from error
     return _median_seconds(update)
 
 

@@ -75,7 +75,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
 
     result: dict[str, Any] = {"repeats": repeats, "batch_size": batch_size} | circumstances()
     batch = noise_batch(batch_size).to(device)
-    replay = OnDevice([_noise()], device) if on_gpu else None
+    replay = OnDevice([noise_replay()], device) if on_gpu else None
     sides: dict[str, Work] = {}
     of: dict[str, str] = {}
     for reference, ours, agent in ((REFERENCE, OURS, "merl"), (DRQV2, OUR_DRQV2, "drqv2")):
@@ -165,17 +165,22 @@ def as_sample(batch: Batch, *, vector: bool) -> Sample:
 
 
 def learner_of(
-    agent: str, precision: Literal["fp32", "bf16"], device: torch.device, side: int = SIDE
+    agent: str,
+    precision: Literal["fp32", "bf16"],
+    device: torch.device,
+    side: int = SIDE,
+    *,
+    compiled: bool = False,
 ) -> DDPG:
     """Ours, in the size that is timed, for pictures of `side` pixels squared."""
-    config = dataclasses.replace(AGENTS[agent], precision=precision)
+    config = dataclasses.replace(AGENTS[agent], precision=precision, compile=compiled)
     if agent == "merl":
         config = dataclasses.replace(config, head_layers=LAYERS)
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
     return make_agent(config, space_of(side), actions, frame_stack=STACK, seed=0, device=device)
 
 
-def _noise(steps: int = 2000) -> Replay:
+def noise_replay(steps: int = 2000) -> Replay:
     """A replay of noise, in episodes of 250 steps."""
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
     replay = Replay(ReplayConfig(), space_of(), actions, capacity=steps)

@@ -1,0 +1,207 @@
+"""All that is to be measured on a GPU, in one go: python docs/measure_gpu.py --out FOLDER.
+
+Four parts, each written as soon as it is done; one that fails is told and does not stop the others:
+
+gains     the whole update, drawn on the card, as it is and with one thing changed at a time
+profile   which kernels an update consists of, and how long each takes
+update    merl bench update
+train     merl bench train: the whole loop, with one environment and with several
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from statistics import median
+from typing import Any, Literal
+from unittest.mock import patch
+
+import torch
+import tyro
+from rich.console import Console
+from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
+
+from merl.bench import train, update
+from merl.bench.measuring import circumstances, spread
+from merl.networks import augmentation, encoders
+from merl.networks.critic import TwinCritic
+from merl.replay.on_device import OnDevice
+from merl.training.parts import choose_device
+from merl.training.updating import UpdateOnDevice
+
+LAUNCHED_ONE_BY_ONE = 10**9
+"""Updates before a graph is recorded: never."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Form:
+    """Of an update: as it is, or otherwise in one way."""
+
+    precision: Literal["bf16", "fp32"] = "bf16"
+    compiled: bool = False
+    warm_up: int = UpdateOnDevice.WARM_UP
+    change: Callable[[], AbstractContextManager[Any]] = nullcontext
+
+
+def main(
+    out: Path = Path("gpu"),
+    parts: tuple[Literal["gains", "profile", "update", "train"], ...] = (
+        "gains",
+        "profile",
+        "update",
+        "train",
+    ),
+    agent: Literal["merl", "drqv2"] = "merl",
+    batch_size: int = 256,
+    updates: int = 100,
+    repeats: int = 7,
+) -> None:
+    """Measure.
+
+    Args:
+        out: the folder for what was found.
+        parts: which.
+        agent: whose update, in gains and profile.
+        batch_size: B, in all but train.
+        updates: of a turn, in gains.
+        repeats: turns of each side.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    console = Console()
+    console.print(circumstances())
+    for name, part in {
+        "gains": lambda: gains(agent, batch_size, updates, repeats),
+        "profile": lambda: kernels(agent, batch_size),
+        "update": lambda: shown(update, repeats=repeats, batch_size=batch_size),
+        "train": lambda: shown(train, repeats=min(repeats, 3)),
+    }.items():
+        if name not in parts:
+            continue
+        try:
+            found = part()
+        except Exception as error:
+            console.print(f"{name} failed: {type(error).__name__}: {error}", markup=False)
+            continue
+        (out / f"{name}.json").write_text(json.dumps(found, indent=1))
+
+
+def shown(bench: Any, **asked: Any) -> Any:
+    """What a bench found; printed, too."""
+    result = bench.run(**asked)
+    Console().print(bench.table(result))
+    return result
+
+
+def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, Any]:
+    """Updates per second of every form, in turns."""
+    forms = {
+        "as it is": Form(),
+        "without a CUDA graph": Form(warm_up=LAUNCHED_ONE_BY_ONE),
+        "twin critics one by one": Form(change=lambda: patch.object(TwinCritic, "at_once", False)),
+        "channels first": Form(change=channels_first),
+        "convolutions as cuDNN guesses": Form(change=guessed),
+        "compiled": Form(compiled=True),
+        "fp32": Form(precision="fp32"),
+        "fp32, compiled": Form(precision="fp32", compiled=True),
+    }
+    works = {}
+    for name, form in forms.items():
+        try:
+            begun = time.perf_counter()
+            works[name] = work_of(agent, batch_size, form)
+            print(f"{name}: ready in {time.perf_counter() - begun:.1f} s", file=sys.stderr)
+        except Exception as error:
+            print(f"{name}: left out, {type(error).__name__}: {error}", file=sys.stderr)
+    rates: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(repeats):
+        for name, work in works.items():
+            with forms[name].change():
+                rates[name].append(updates / seconds(work, updates))
+    whole = median(rates["as it is"])
+    for name, each in rates.items():
+        print(f"| {name} | {median(each):,.1f} | {median(each) / whole:.2f} |")
+    found = {name: spread(each) for name, each in rates.items()}
+    return {"updates_per_s": found, "batch_size": batch_size, "agent": agent} | circumstances()
+
+
+def work_of(agent: str, batch_size: int, form: Form) -> UpdateOnDevice:
+    """An update in that form, recorded and ready."""
+    device = choose_device("auto")
+    with form.change():
+        learner = update.learner_of(agent, form.precision, device, compiled=form.compiled)
+        if form.change is channels_first:
+            learner.networks.encoders.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+        replay = OnDevice([update.noise_replay()], device)
+        work = UpdateOnDevice(learner, replay, batch_size, seed=0)
+        work.WARM_UP = form.warm_up  # type: ignore[misc]
+        for _ in range(UpdateOnDevice.WARM_UP + 2):
+            work()
+        wait()
+    return work
+
+
+def kernels(agent: str, batch_size: int, updates: int = 20) -> dict[str, Any]:
+    """What an update consists of, longest first; on a GPU kernels, else operations."""
+    work = work_of(agent, batch_size, Form())
+    on_gpu = torch.cuda.is_available()
+    kind = ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU
+    with profile(activities=[kind]) as profiled:
+        seconds(work, updates)
+    rows = []
+    for event in profiled.key_averages():
+        own = event.self_device_time_total if on_gpu else event.self_cpu_time_total
+        rows.append((own / updates, event.count / updates, event.key))
+    rows.sort(reverse=True)
+    count, total = sum(row[1] for row in rows), sum(row[0] for row in rows)
+    print(f"{count:.0f} kernels, {total:,.0f} us an update")
+    for microseconds, often, name in rows[:25]:
+        print(f"{microseconds:10,.1f} us {often:6.1f} x  {name[:100]}")
+    return {"microseconds": total, "kernels": count, "longest": rows[:60]} | circumstances()
+
+
+def seconds(work: Callable[[], object], times: int) -> float:
+    """Of doing it so many times, to its end on the card."""
+    wait()
+    begun = time.perf_counter()
+    for _ in range(times):
+        work()
+    wait()
+    return time.perf_counter() - begun
+
+
+def wait() -> None:
+    """For the card."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+@contextmanager
+def channels_first() -> Iterator[None]:
+    """Pictures in torch's own order."""
+    as_input = augmentation.to_input
+
+    def contiguous(images: Tensor, dtype: torch.dtype) -> Tensor:
+        return as_input(images, dtype).contiguous()
+
+    with patch.object(encoders, "to_input", contiguous):
+        yield
+
+
+@contextmanager
+def guessed() -> Iterator[None]:
+    """Ways to convolve that are not timed first."""
+    torch.backends.cudnn.benchmark = False
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.benchmark = True
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

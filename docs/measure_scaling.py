@@ -1,8 +1,9 @@
 """How cost grows with batch, picture, environments and replay: python docs/measure_scaling.py.
 
-Numbers go to docs/data/scaling.csv, the picture to docs/images/scaling.png; `--plot-only` draws
-what is there. All sizes of one question take turns, in rounds; wall-clock time, so leave the
-machine alone. The updates are the paper's (six layers) in bf16, on all cores.
+Numbers go to docs/data/scaling.csv, the picture to docs/images/scaling.png; `--questions` with
+nothing behind it draws what is there. All sizes of one question take turns, in rounds, but for
+replays; wall-clock time, so leave the machine alone. The updates are the paper's (six layers) in
+bf16, on all cores.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -33,7 +36,7 @@ from merl.bench.train import steps_per_second
 from merl.bench.update import ACTIONS, learner_of, noise_batch, space_of
 from merl.core import Transition
 from merl.envs import make_env
-from merl.replay import Replay, ReplayConfig
+from merl.replay import Replay, ReplayConfig, replay_bytes, ring
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
 from merl.resources import free_disk
 from merl.training.timing import use_threads
@@ -44,30 +47,45 @@ FIELDS = ("question", "side", "x", "median", "low", "high")
 BATCHES = (16, 32, 64, 128, 256, 512)
 SIDES = (32, 48, 64, 84, 100, 128)
 ENVIRONMENTS = (1, 2, 3, 4)
-CAPACITIES = (1000, 10_000, 100_000, 300_000)
+CAPACITIES = (1000, 10_000, 100_000, 300_000, 1_000_000, 1_500_000)
+SAMPLES = 20
+"""Batches of a turn, where a replay is sampled."""
 EPISODE = 250
 ACTION_SPACE = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
 
 Row = tuple[str, str, int, float, float, float]
 
 
-def main(repeats: int = 7, plot_only: bool = False) -> None:
-    """Measure every question, then draw.
+def main(
+    repeats: int = 7,
+    questions: tuple[Literal["batch", "image", "environments", "replay"], ...] = (
+        "batch",
+        "image",
+        "environments",
+        "replay",
+    ),
+    place: Path | None = None,
+) -> None:
+    """Measure, then draw.
 
     Args:
         repeats: rounds.
-        plot_only: draw what was measured before.
+        questions: what is asked; of the others what was measured before stays. None draws only.
+        place: a folder on the disk that replays are to lie on; temporary files' if not set.
     """
-    if not plot_only:
-        print(circumstances())
-        use_threads(torch.get_num_threads())
+    ask = {"batch": batches, "image": sides, "environments": environments}
+    print(circumstances())
+    use_threads(torch.get_num_threads())
+    with CSV.open() as file:
+        rows: list[Any] = list(csv.reader(file))[1:]
+    for question in questions:
+        asked = ask[question](repeats) if question in ask else capacities(repeats, place)
+        rows = [row for row in rows if row[0] != question]
+        for row in asked:
+            rows.append(row)
+            print(*row, flush=True)
         with CSV.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(FIELDS)
-            for ask in (batches, sides, environments, capacities):
-                for row in ask(repeats):
-                    writer.writerow(row)
-                    print(*row, flush=True)
+            csv.writer(file).writerows([FIELDS, *rows])
     draw()
 
 
@@ -100,23 +118,39 @@ def environments(repeats: int) -> Iterator[Row]:
         yield _row("environments", side, count, each)
 
 
-def capacities(repeats: int) -> Iterator[Row]:
-    """Milliseconds to sample 256 pairs, by the steps in the replay."""
+def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
+    """Milliseconds to sample 256 pairs, by the steps in the replay; each replay by itself.
+
+    Also those that do not fit into memory, which merl refuses: check and reading ahead are taken
+    away here to show what they are for.
+    """
     seen = _arm()
-    with tempfile.TemporaryDirectory() as folder:
-        works: dict[tuple[str, int], Work] = {}
-        for compress in (False, True):
-            for capacity in CAPACITIES:
-                if capacity * 21_200 > 0.5 * free_disk(Path(folder)):
-                    continue
-                config = ReplayConfig(capacity=capacity, compress=compress)
-                place = Path(folder) / f"{capacity}-{compress}"
-                ring = Replay(config, space_of(), ACTION_SPACE, directory=place)
-                _fill(ring, seen, capacity)
-                rng = np.random.default_rng(0)
-                name = "compressed" if compress else "raw"
-                works[name, capacity] = partial(ring.sample, 256, rng)
-        yield from _rows("replay", works, repeats)
+    for compress, capacity in product((False, True), CAPACITIES):
+        config = ReplayConfig(capacity=capacity, compress=compress)
+        with tempfile.TemporaryDirectory(dir=place) as folder, patch.object(ring, "check_fits"):
+            if replay_bytes(config, space_of(), ACTION_SPACE) > 0.9 * free_disk(Path(folder)):
+                print(f"{capacity:,} steps are left out: the disk is too small")
+                continue
+            replay = Replay(config, space_of(), ACTION_SPACE, directory=Path(folder) / "replay")
+            _fill(replay, seen, capacity)
+            replay.flush()
+            name, rng = "compressed" if compress else "raw", np.random.default_rng(0)
+            sample = partial(_samples, replay, rng)
+            works: dict[tuple[str, int], Work] = {(name, capacity): sample}
+            if not compress:
+                works["raw, not read ahead", capacity] = partial(_as_touched, sample)
+            for (side, x), each in take_turns(works, repeats).items():
+                yield _row("replay", side, x, [1e3 * seconds / SAMPLES for seconds in each])
+
+
+def _samples(replay: Replay, rng: np.random.Generator) -> None:
+    for _ in range(SAMPLES):
+        replay.sample(256, rng)
+
+
+def _as_touched(sample: Work) -> None:
+    with patch.object(ring, "will_need"):
+        sample()
 
 
 def _rows(question: str, works: Mapping[tuple[str, int], Work], repeats: int) -> Iterator[Row]:
@@ -173,7 +207,7 @@ def draw() -> None:
     _panel(
         panels[1, 0], rows, "environments", "steps a second", "environments", xlog=False, ylog=False
     )
-    _panel(panels[1, 1], rows, "replay", "ms for 256 pairs", "steps held", xlog=True, ylog=False)
+    _panel(panels[1, 1], rows, "replay", "ms for 256 pairs", "steps held", xlog=True, ylog=True)
     save(figure, PICTURE)
     print(f"{PICTURE} ({DPI} dpi)")
 

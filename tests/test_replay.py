@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
+import math
+import mmap
 import os
 import resource
 import tempfile
@@ -20,7 +22,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.replay import Replay, ReplayConfig, check_fits, replay_bytes
+from merl.replay import Replay, ReplayConfig, check_fits, replay_bytes, ring
+from merl.replay.storage import will_need
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
 OBSERVATIONS = gymnasium.spaces.Dict(
@@ -251,6 +254,43 @@ def test_the_same_generator_and_content_give_the_same_batch():
     assert torch.equal(one.action, two.action)
     assert torch.equal(one.next_observation["front"], two.next_observation["front"])
     assert not torch.equal(one.action, other.action)
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_what_is_read_ahead_holds_every_picture_of_the_batch(tmp_path, monkeypatch, compress):
+    replay = make(tmp_path / "ring", capacity=30, compress=compress)
+    account = Account(replay.config)
+    for episode in range(9):  # it wraps
+        for t in range(8):
+            write(replay, account, episode, t, Episode(7, "limit"))
+    asked, picks, pick = [], [], replay._sampler.pick
+    monkeypatch.setattr(ring, "will_need", lambda _, *stretch: asked.append(stretch))
+    replay._sampler.pick = lambda *a, **k: (picks.append(pick(*a, **k)), picks[0])[1]
+    replay.sample(1, Every())
+    slots = torch.cat([picks[0].now, picks[0].then], dim=1).numpy()
+    for (key, shape), (begin, end) in zip(IMAGES.items(), asked, strict=True):
+        name, size = replay.keys[key], math.prod(shape)
+        at, count = slots * size, size
+        if compress:
+            at, count = np.moveaxis(replay._data[f"{name}.span"][slots], -1, 0)
+            at = at % len(replay._pictures[name]._ring)
+        in_one_piece = end > begin
+        assert in_one_piece.mean() > 0.5
+        assert compress or not in_one_piece.all()
+        assert (begin[:, None] <= at)[in_one_piece].all()
+        assert (at + count <= end[:, None])[in_one_piece].all()
+        assert (end - begin)[in_one_piece].max() < 8 * (size + 64)
+
+
+def test_pictures_that_are_on_the_disk_alone_are_fetched(tmp_path):
+    with (tmp_path / "pictures").open("w+b") as file:
+        file.write(np.arange(10 * mmap.PAGESIZE // 8).tobytes())
+        file.flush()
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        with mmap.mmap(file.fileno(), 0) as mapped:
+            will_need(mapped, np.array([5000, 100, 9000]), np.array([9000, 50, 10 * mmap.PAGESIZE]))
+            assert np.array_equal(np.frombuffer(bytes(mapped), np.int64), np.arange(5120))
 
 
 def test_every_step_is_drawn_equally_often():

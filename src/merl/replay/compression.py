@@ -93,6 +93,17 @@ class CompressedPictures:
         """Have the next picture come behind a slot's, or first of all."""
         self._head = 0 if slot is None else int(self._spans[slot].sum())
 
+    def stretch(
+        self, first: NDArray[np.int64], last: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Where the bytes from one slot's picture to another's begin and end, of many such pairs.
+
+        Where the ring's end lies between the two, the end comes before the beginning.
+        """
+        begin, (end, count) = self._spans[first, 0], self._spans[last].T
+        length = len(self._ring)
+        return begin % length, end % length + count
+
     def take(self, slots: NDArray[np.int64]) -> NDArray[np.uint8]:
         """The pictures of slots (...), as (..., *shape)."""
         flat = slots.reshape(-1)

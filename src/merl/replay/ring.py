@@ -27,17 +27,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from merl.core import Batch, MerlError, Observation, Transition
+from merl.core import Batch, MerlError, Observation, Transition, is_image
 from merl.replay.compression import CompressedPictures
 from merl.replay.config import ReplayConfig, check_fits, slots_for
 from merl.replay.journal import Journal
-from merl.replay.sampling import Sampler
+from merl.replay.sampling import Picks, Sampler
 from merl.replay.storage import (
     check_value,
     field_name,
     fields_of,
     open_files,
     span_name,
+    will_need,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -115,6 +116,7 @@ class Replay:
         }
         self._data = arrays  # a row for each slot
         self._values = {**fields_of(observation_space, action_space)}  # what is written
+        self._images = [n for key, n in self.keys.items() if is_image(observation_space[key])]
         self._journal: Journal | None = None
         if directory is not None:
             self._journal = Journal(directory, self._data, self._pictures)
@@ -191,6 +193,7 @@ class Replay:
             newest=torch.tensor([self._moments]),
             base=torch.tensor([0]),
         )
+        self._read_ahead(picks)
         return Batch(
             observation=self._observation(picks.now),
             action=self._sampler.action(picks),
@@ -343,6 +346,20 @@ class Replay:
         self._first = self._steps - len(sources)
         self.sources[np.arange(self._steps - len(sources), self._steps) % self.capacity] = sources
         self._forget()
+
+    def _read_ahead(self, picks: Picks) -> None:
+        """Have the pictures of a batch fetched that are on the disk alone.
+
+        So it is after a resumption, and wherever others use the memory. A sample's lie in one
+        piece, but for where the ring ends.
+        """
+        first, last = picks.now[:, 0].numpy(), picks.then[:, -1].numpy()
+        for name, file in self._files.items():
+            if name in self._pictures:
+                will_need(file, *self._pictures[name].stretch(first, last))
+            elif name in self._images:
+                size = self._values[name].bytes
+                will_need(file, first * size, (last + 1) * size)
 
     def _observation(self, slots: torch.Tensor) -> dict[str, torch.Tensor]:
         """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""

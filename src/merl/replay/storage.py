@@ -22,6 +22,7 @@ from urllib.parse import quote
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
 from merl.core import MerlError, is_image, is_vector
 from merl.replay.compression import reserved_bytes
@@ -136,6 +137,18 @@ def open_files(
             raise MerlError(f"cannot keep a replay in {directory}: {why}") from error
         raise
     return files
+
+
+def will_need(file: mmap.mmap, begin: NDArray[np.int64], end: NDArray[np.int64]) -> None:
+    """Have the system read these bytes of a file from the disk: all at once, without waiting.
+
+    Touched one after the other, each is waited for. What is in memory already costs 2 us, and
+    stretches that end before they begin are passed over.
+    """
+    begin = begin // mmap.PAGESIZE * mmap.PAGESIZE
+    for at, count in zip(begin.tolist(), (end - begin).tolist(), strict=True):
+        if count > 0:
+            file.madvise(mmap.MADV_WILLNEED, at, count)
 
 
 def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:

@@ -1,7 +1,9 @@
 """All that is to be measured on a GPU, in one go: python docs/measure_gpu.py --out FOLDER.
 
-Four parts, each written as soon as it is done; one that fails is told and does not stop the others:
+Five parts, each written as soon as it is done; one that fails is told and does not stop the others:
 
+launches  of how many operations an update consists: what it costs without a CUDA graph, and much of
+          it with one; the same on a CPU
 gains     the whole update, drawn on the card, as it is and with one thing changed at a time
 profile   which kernels an update consists of, and how long each takes
 update    merl bench update
@@ -26,6 +28,7 @@ import tyro
 from rich.console import Console
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from merl.bench import train, update
 from merl.bench.measuring import circumstances, spread
@@ -51,7 +54,8 @@ class Form:
 
 def main(
     out: Path = Path("gpu"),
-    parts: tuple[Literal["gains", "profile", "update", "train"], ...] = (
+    parts: tuple[Literal["launches", "gains", "profile", "update", "train"], ...] = (
+        "launches",
         "gains",
         "profile",
         "update",
@@ -76,6 +80,7 @@ def main(
     console = Console()
     console.print(circumstances())
     for name, part in {
+        "launches": lambda: launches(agent),
         "gains": lambda: gains(agent, batch_size, updates, repeats),
         "profile": lambda: kernels(agent, batch_size),
         "update": lambda: shown(update, repeats=repeats, batch_size=batch_size),
@@ -96,6 +101,36 @@ def shown(bench: Any, **asked: Any) -> Any:
     result = bench.run(**asked)
     Console().print(bench.table(result))
     return result
+
+
+class Launches(TorchDispatchMode):
+    """Counts the operations that compute something."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(
+        self, operation: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        name = operation.name()
+        makes_no_kernel = any(part in name for part in ("empty", "profiler", "detach"))
+        self.count += not (operation.is_view or makes_no_kernel)
+        return operation(*args, **(kwargs or {}))
+
+
+def launches(agent: str) -> dict[str, int]:
+    """Of an update in bf16 with the twin critics one by one, and at once."""
+    batch, counts = update.noise_batch(8), {}
+    for name, at_once in (("one by one", False), ("at once", True)):
+        learner = update.learner_of(agent, "bf16", torch.device("cpu"))
+        with patch.object(TwinCritic, "at_once", at_once):
+            learner.update(batch)
+            with Launches() as launches:
+                learner.update(batch)
+        counts[name] = launches.count
+        print(f"twin critics {name}: {launches.count} operations")
+    return counts
 
 
 def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, Any]:

@@ -246,6 +246,9 @@ def _panel(
     ticks = sorted({int(row["x"]) for row in mine})
     if xlog:
         axes.set_xscale("log")
+        near = 0.08 * np.log(ticks[-1] / ticks[0])  # so near to the one before, labels overlap
+        apart = np.diff(np.log(ticks), prepend=-np.inf) > near
+        ticks = [tick for tick, keep in zip(ticks, apart, strict=True) if keep]
     axes.xaxis.set_major_locator(FixedLocator(ticks))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_minor_locator(NullLocator())

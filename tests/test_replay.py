@@ -692,6 +692,22 @@ def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, whe
     check_fits(settings, OBSERVATIONS, ACTIONS, directory=directory, capacity=largest)
 
 
+def test_where_compression_would_fit_that_is_said(monkeypatch):
+    camera = gymnasium.spaces.Box(0, 255, (84, 84, 3), np.uint8)
+    spaces = gymnasium.spaces.Dict({"camera": camera})
+    monkeypatch.setattr("merl.replay.config.available_memory", lambda: 8_000_000_000)
+    with pytest.raises(MerlError) as caught:
+        check_fits(ReplayConfig(), spaces, ACTIONS)
+    words = str(caught.value).split()
+    small = replay_bytes(ReplayConfig(compress=True), spaces, ACTIONS)
+    assert words[words.index("--replay.compress") + 4] == f"{small / 1e9:.3g}"
+    assert "--replay.capacity" in words
+    check_fits(ReplayConfig(compress=True), spaces, ACTIONS)
+    monkeypatch.setattr("merl.replay.config.available_memory", lambda: 5_000_000_000)
+    with pytest.raises(MerlError, match=r"available: --replay\.capacity"):
+        check_fits(ReplayConfig(), spaces, ACTIONS)
+
+
 def test_memory_alone_counts_without_a_directory(monkeypatch):
     monkeypatch.setattr("merl.replay.config.free_disk", lambda *_: 0)
     make()

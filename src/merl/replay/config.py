@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gymnasium
@@ -125,6 +125,10 @@ def _too_large(
         fits = replay_bytes(config, observation_space, action_space, middle) <= room
         low, high = (middle, high) if fits else (low, middle)
     way_out = f"--replay.capacity {low} would fit" if low else "free some"
+    compressed = replace(config, compress=True)
+    small = replay_bytes(compressed, observation_space, action_space, capacity)
+    if small < need and small <= room:
+        way_out = f"--replay.compress brings it to {small / 1e9:.3g} GB, or {way_out}"
     return MerlError(
         f"a replay of {capacity:,} steps needs {need / 1e9:.3g} GB, but {room / 1e9:.3g} GB "
         f"{what}: {way_out}"

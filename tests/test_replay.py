@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.replay import Replay, ReplayConfig, check_fits, replay_bytes, ring
+from merl.replay import Lanes, Replay, ReplayConfig, check_fits, replay_bytes, ring
 from merl.replay.storage import will_need
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
@@ -291,6 +291,35 @@ def test_pictures_that_are_on_the_disk_alone_are_fetched(tmp_path):
         with mmap.mmap(file.fileno(), 0) as mapped:
             will_need(mapped, np.array([5000, 100, 9000]), np.array([9000, 50, 10 * mmap.PAGESIZE]))
             assert np.array_equal(np.frombuffer(bytes(mapped), np.int64), np.arange(5120))
+
+
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("count", [1, 3])
+def test_frames_are_copied_as_it_is_told(compress, count):
+    """What is made of a stack meets the stack, its place and its number in the batch."""
+    lanes = Lanes(config(capacity=90, compress=compress), OBSERVATIONS, ACTIONS, count=count)
+    for number, lane in enumerate(lanes.lanes):
+        account = Account(lane.config)
+        for episode in range(4):
+            for t in range(9):
+                write(lane, account, 10 * number + episode, t, Episode(8, "limit"))
+    plain = lanes.sample(50, np.random.default_rng(3))
+    told = []
+
+    def mirrored(sample, frames, out):
+        told.append(sample)
+        out[:] = 255 - frames
+
+    batch = lanes.sample(
+        50, np.random.default_rng(3), {"front": mirrored}, {"wrist/left": mirrored}
+    )
+    assert sorted(told) == sorted([*range(50), *range(50)])
+    assert torch.equal(batch.observation["front"], 255 - plain.observation["front"])
+    assert torch.equal(batch.observation["wrist/left"], plain.observation["wrist/left"])
+    assert torch.equal(batch.next_observation["front"], plain.next_observation["front"])
+    mirror = 255 - plain.next_observation["wrist/left"]
+    assert torch.equal(batch.next_observation["wrist/left"], mirror)
+    assert torch.equal(batch.reward, plain.reward)
 
 
 def test_every_step_is_drawn_equally_often():

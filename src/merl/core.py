@@ -6,7 +6,7 @@ Names follow the field: an *observation* is a dict of modalities, a *transition*
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Protocol
@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 Observation = Mapping[str, NDArray[Any]]
 """One moment as the senses give it, a key per modality: an image is uint8 (H, W, C), a vector
 float32 (n,). Frames are single; stacks are made by the actor and by replay."""
+
+Copy = Callable[[int, NDArray[np.uint8], NDArray[np.uint8]], None]
+"""How a stack of frames is taken out of the replay for a batch: told are the sample's number in the
+batch, the frames (K, H, W, C), and where they are to go."""
+Copies = Mapping[str, Copy]
+"""By image key."""
 
 
 CONFIG_FILE = "config.json"

@@ -63,7 +63,7 @@ def test_the_seed_is_of_the_weights_too() -> None:
 
 
 def test_the_seed_is_of_the_draws_too() -> None:
-    first, again, other = (CASE.agent(seed).draw(CASE.batch_of(0)) for seed in (1, 1, 2))
+    first, again, other = (CASE.agent(seed).draw(CASE.batch) for seed in (1, 1, 2))
     assert torch.equal(first.next_noise, again.next_noise)
     assert torch.equal(first.shifts["image"], again.shifts["image"])
     assert not torch.equal(first.next_noise, other.next_noise)

@@ -142,5 +142,5 @@ def test_a_users_keys_may_be_called_anything() -> None:
     batch = Batch(
         observation, torch.zeros((1, 9)), torch.zeros(1), torch.ones(1), dict(observation)
     )
-    assert set(agent.draw(batch).shifts) == {"type", "wrist camera"}
+    assert set(agent.draw(len(batch.action)).shifts) == {"type", "wrist camera"}
     agent.update(batch)

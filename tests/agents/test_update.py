@@ -296,7 +296,7 @@ def test_update_is_learn_with_its_own_draws() -> None:
     case, agent, twin = CASES[0], CASES[0].agent(), CASES[0].agent()
     for seed in range(2):
         batch = case.batch_of(seed)
-        found, expected = agent.update(batch), twin.learn(batch, twin.draw(batch))
+        found, expected = agent.update(batch), twin.learn(batch, twin.draw(len(batch.action)))
         assert found.keys() == expected.keys()
         assert all(torch.equal(found[name], expected[name]) for name in found)
     assert all(map(torch.equal, weights_of(agent).values(), weights_of(twin).values()))
@@ -307,7 +307,7 @@ def test_draws_are_clipped_noise_and_whole_shifts() -> None:
     case = replace(CASES[5], batch=4000)
     batch = replace(CASES[5], batch=1).batch_of(0)
     batch = replace(batch, action=torch.zeros(case.batch, 6))
-    draws = case.agent().draw(batch)
+    draws = case.agent().draw(len(batch.action))
     for noise in (draws.next_noise, draws.actor_noise):
         assert noise.shape == batch.action.shape
         assert noise.abs().max() == pytest.approx(0.3)
@@ -326,7 +326,7 @@ def test_draws_are_clipped_noise_and_whole_shifts() -> None:
 
 def test_no_shift_is_drawn_where_there_is_none() -> None:
     case = replace(CASES[0], config=replace(SMALL, shift_pad=0))
-    assert case.agent().draw(case.batch_of(0)).shifts == {}
+    assert case.agent().draw(case.batch).shifts == {}
     agent = double(case.agent())
     state = state_of(agent)
     batch = case.batch_of(0, torch.float64)

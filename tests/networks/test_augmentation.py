@@ -10,7 +10,6 @@ from torch.nn import functional
 
 from merl.networks.augmentation import (
     _shift_by_index,
-    _shift_by_slices,
     draw_shifts,
     shift,
     to_input,
@@ -19,11 +18,7 @@ from merl.networks.augmentation import (
 SHAPES = [(1, 3, 84, 84, 3), (5, 2, 9, 12, 1), (3, 1, 4, 3, 3)]  # (B, K, H, W, C)
 
 
-def by_slices(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
-    return torch.from_numpy(_shift_by_slices(images.numpy(), shifts.numpy(), pad))
-
-
-both_paths = pytest.mark.parametrize("path", [by_slices, _shift_by_index, shift])
+both_paths = pytest.mark.parametrize("path", [_shift_by_index, shift])
 
 
 def pictures(shape: tuple[int, ...], seed: int = 0) -> Tensor:

@@ -198,6 +198,16 @@ def test_a_frame_that_is_refilled_does_not_change_the_stack() -> None:
     assert stack.observation()["camera"][0, :, 0, 0, 0].tolist() == [0, 1, 2]
 
 
+@pytest.mark.parametrize("pad", [0, 1])
+def test_shifted_where_they_are_copied_pictures_are_learnt_from_alike(pad: int) -> None:
+    agent = dataclasses.replace(CONFIG.agent, shift_pad=pad)
+    parts, twin = (Parts(dataclasses.replace(CONFIG, agent=agent)) for _ in range(2))
+    twin.update = lambda: twin.agent.update(twin.replay.sample(8, twin.randomness.batches))
+    parts.run()
+    twin.run()
+    assert torch.equal(parts.weights(), twin.weights())
+
+
 NOISES = [
     CONFIG.agent,
     dataclasses.replace(CONFIG.agent, noise_std=1.0, noise_std_end=0.1, noise_steps=60),

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 from merl.agents.config import AgentConfig
 from merl.agents.networks import Networks
-from merl.core import Batch
-from merl.networks.augmentation import draw_shifts
+from merl.core import Batch, Copies
+from merl.networks.augmentation import Crop, draw_shifts
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Draws:
     """The random numbers of one update.
 
     Attributes:
-        shifts: crops of o_t, per image key int64 (B, 2).
+        shifts: crops of o_t, per image key int64 (B, 2); none where the batch is shifted already.
         next_shifts: crops of o_{t+n}, likewise.
         next_noise: epsilon of the target's action, (B, A): clipped here, standard normal in SAC.
         actor_noise: epsilon of the actor's action, likewise.
@@ -124,7 +124,7 @@ class DDPG:
 
     def update(self, batch: Batch) -> dict[str, Tensor]:
         """One gradient step on critic, encoders and actor, and one step of the target."""
-        return self.learn(batch.to(self.device), self.draw(batch))
+        return self.learn(batch.to(self.device), self.draw(len(batch.action)))
 
     def learn(self, batch: Batch, draws: Draws) -> dict[str, Tensor]:
         """`update` with its random numbers given: augment and encode, critic, actor, target."""
@@ -203,19 +203,28 @@ class DDPG:
         recent: list[Tensor] = [p for part in self._averaged().values() for p in part.parameters()]
         torch._foreach_lerp_(average, recent, self.config.tau)
 
-    def draw(self, batch: Batch) -> Draws:
-        """The random numbers of the next update."""
+    def draw(self, size: int) -> Draws:
+        """The random numbers of the next update, from a batch of so many samples."""
         generator = self.learning
-        size, pad = len(batch.action), self.networks.encoders.pad
+        pad, shape = self.networks.encoders.pad, (size, self.networks.actor.action_dim)
         keys = self.networks.encoders.image_keys if pad else ()
         shifts, next_shifts = (
             {key: draw_shifts(size, pad, generator) for key in keys} for _ in range(2)
         )
         noise, next_noise = (
-            self.epsilon(torch.randn(batch.action.shape, generator=generator, device=self.device))
+            self.epsilon(torch.randn(shape, generator=generator, device=self.device))
             for _ in range(2)
         )
         return Draws(shifts, next_shifts, next_noise, noise)
+
+    def copies(self, draws: Draws) -> tuple[Copies, Copies]:
+        """The draws' shifts of o_t and o_{t+n}, for a replay that applies them when it samples."""
+        pad = self.networks.encoders.pad
+        now, then = (
+            {key: Crop(shifts, pad) for key, shifts in each.items()}
+            for each in (draws.shifts, draws.next_shifts)
+        )
+        return now, then
 
     def epsilon(self, noise: Tensor) -> Tensor:
         """Standard normal numbers to the noise of an update: clip(N(0, sigma^2), -c, c)."""

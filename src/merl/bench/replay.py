@@ -17,9 +17,9 @@ from rich.table import Table
 from torch import Tensor
 
 from merl.bench.measuring import Work, circumstances, seconds, shown, spread, take_turns
-from merl.core import Transition
+from merl.core import Copies, Transition
 from merl.envs import make_env
-from merl.networks.augmentation import draw_shifts, shift, to_input
+from merl.networks.augmentation import Crop, draw_shifts, to_input
 from merl.replay import Replay, ReplayConfig, replay_bytes
 
 EPISODE, PAD, MILLION = 250, 4, 1_000_000
@@ -159,12 +159,13 @@ def _stages(ring: Replay, batch_size: int) -> dict[str, Work]:
     """A batch, as far as each of `STAGES`."""
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
 
-    def sample() -> list[Tensor]:
-        batch = ring.sample(batch_size, rng)
+    def sample(*copies: Copies) -> list[Tensor]:
+        batch = ring.sample(batch_size, rng, *copies)
         return [batch.observation["image"], batch.next_observation["image"]]
 
     def ready() -> list[Tensor]:
-        return [shift(stack, draw_shifts(batch_size, PAD, generator), PAD) for stack in sample()]
+        shifts = (draw_shifts(batch_size, PAD, generator) for _ in range(2))
+        return sample(*({"image": Crop(each, PAD)} for each in shifts))
 
     def as_input() -> list[Tensor]:
         return [to_input(stack, torch.float32) for stack in ready()]

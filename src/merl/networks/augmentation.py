@@ -29,35 +29,48 @@ def shift(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
     Returns:
         The shifted stacks, in the shape of `images`.
     """
-    if images.device.type == "cpu":
-        return torch.from_numpy(_shift_by_slices(images.numpy(), shifts.numpy(), pad))
-    return _shift_by_index(images, shifts, pad)
-
-
-def _shift_by_slices(
-    images: NDArray[np.uint8], shifts: NDArray[np.int64], pad: int
-) -> NDArray[np.uint8]:
-    """A slice per sample, and the edges from beside it: rows are copied whole, and once."""
-    height, width = images.shape[2:4]
-    shifted = np.empty_like(images)
-    for image, moved, (row, column) in zip(images, shifted, shifts.tolist(), strict=True):
-        # What comes to (y, x) was at (y + down, x + right); further than the last edge is as far.
-        down = min(max(row - pad, 1 - height), height - 1)
-        right = min(max(column - pad, 1 - width), width - 1)
-        top, bottom = max(-down, 0), height - max(down, 0)
-        left, side = max(-right, 0), width - max(right, 0)
-        moved[:, top:bottom, left:side] = image[
-            :, top + down : bottom + down, left + right : side + right
-        ]
-        if right:
-            edge = left if right < 0 else side - 1
-            beyond = slice(left) if right < 0 else slice(side, None)
-            moved[:, top:bottom, beyond] = moved[:, top:bottom, edge : edge + 1]
-        if down:
-            edge = top if down < 0 else bottom - 1
-            beyond = slice(top) if down < 0 else slice(bottom, None)
-            moved[:, beyond] = moved[:, edge : edge + 1]
+    if images.device.type != "cpu":
+        return _shift_by_index(images, shifts, pad)
+    shifted = torch.empty_like(images, memory_format=torch.contiguous_format)
+    crop = Crop(shifts, pad)
+    for sample, (frames, out) in enumerate(zip(images.numpy(), shifted.numpy(), strict=True)):
+        crop(sample, frames, out)
     return shifted
+
+
+class Crop:
+    """`shift` sample by sample, for who copies the frames anyway: see `core.Copy`.
+
+    Args:
+        shifts: int64 (B, 2), from `draw_shifts`.
+        pad: pixels by which each side is padded.
+    """
+
+    def __init__(self, shifts: Tensor, pad: int) -> None:
+        self._moves = (shifts - pad).tolist()
+
+    def __call__(self, sample: int, frames: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
+        """Write frames (K, H, W, C) to `out`, cropped as the sample is to be."""
+        height, width, channels = frames.shape[1:]
+        down, right = self._moves[sample]
+        # What comes to (y, x) was at (y + down, x + right); further than the last edge is as far.
+        down = min(max(down, 1 - height), height - 1)
+        right = min(max(right, 1 - width), width - 1)
+        # All bytes move alike, in one piece; what comes across an edge is overwritten.
+        ahead = (down * width + right) * channels
+        source, target = frames.reshape(-1), out.reshape(-1)
+        if ahead >= 0:
+            target[: len(target) - ahead] = source[ahead:]
+        else:
+            target[-ahead:] = source[:ahead]
+        if right > 0:
+            out[:, :, width - right :] = out[:, :, width - right - 1, None]
+        elif right < 0:
+            out[:, :, :-right] = out[:, :, -right, None]
+        if down > 0:
+            out[:, height - down :] = out[:, height - down - 1, None]
+        elif down < 0:
+            out[:, :-down] = out[:, -down, None]
 
 
 def _shift_by_index(images: Tensor, shifts: Tensor, pad: int) -> Tensor:

@@ -72,6 +72,7 @@ class Actor(nn.Module):
 
     def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
         super().__init__()
+        self.action_dim = action_dim
         self.layers = MLP(latent_dim, action_dim, size)
 
     def forward(self, latent: Tensor) -> Tensor:
@@ -90,6 +91,7 @@ class GaussianActor(nn.Module):
 
     def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
         super().__init__()
+        self.action_dim = action_dim
         self.layers = MLP(latent_dim, 2 * action_dim, size)
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:

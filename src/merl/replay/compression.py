@@ -104,18 +104,17 @@ class CompressedPictures:
         length = len(self._ring)
         return begin % length, end % length + count
 
-    def take(self, slots: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """The pictures of slots (...), as (..., *shape)."""
-        flat = slots.reshape(-1)
-        pictures = np.empty((len(flat), self._size), np.uint8)
-        length, size = len(self._ring), self._size
-        buffer, backgrounds = self._ring.data, self._backgrounds
-        decompress, spans = lz4.block.decompress, self._spans[flat]
-        for picture, (begin, count) in zip(pictures, spans.tolist(), strict=True):
-            at = begin % length
-            difference = decompress(buffer[at + 1 : at + count], uncompressed_size=size)
-            np.add(np.frombuffer(difference, np.uint8), backgrounds[buffer[at]], out=picture)
-        return pictures.reshape(*slots.shape, *self.shape)
+    def spans(self, slots: NDArray[np.int64]) -> list[Any]:
+        """Where the pictures of slots (...) lie, for `decode`: nested lists of that shape."""
+        spans: list[Any] = self._spans[slots].tolist()
+        return spans
+
+    def decode(self, span: tuple[int, int], out: NDArray[np.uint8]) -> None:
+        """A picture, into its bytes (H W C,)."""
+        begin, count = span
+        at, kept = begin % len(self._ring), self._ring.data
+        difference = lz4.block.decompress(kept[at + 1 : at + count], uncompressed_size=self._size)
+        np.add(np.frombuffer(difference, np.uint8), self._backgrounds[kept[at]], out=out)
 
     def begun(self, picture: NDArray[np.uint8]) -> None:
         """An episode begins so: after some of them the background is known better."""

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from merl.core import Batch
+from merl.core import Batch, Copies, Copy
 from merl.replay.config import ReplayConfig
 from merl.replay.ring import Replay
 
@@ -64,8 +64,20 @@ class Lanes:
         """Steps that can be sampled now."""
         return sum(len(lane) for lane in self.lanes)
 
-    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+    def sample(
+        self,
+        batch_size: int,
+        rng: np.random.Generator,
+        now: Copies | None = None,
+        then: Copies | None = None,
+    ) -> Batch:
         """Draw steps uniformly, with replacement; those of one lane lie side by side.
+
+        Args:
+            batch_size: B.
+            rng: draws.
+            now: how the frames of o_t are copied out, where not as they are.
+            then: likewise of o_{t+n}.
 
         Returns:
             Tensors on the CPU that are the caller's own; shapes as in `merl.core.Batch`.
@@ -74,13 +86,16 @@ class Lanes:
             ValueError: no step is held yet.
         """
         if len(self.lanes) == 1 or not len(self):
-            return self.lanes[0].sample(batch_size, rng)
+            return self.lanes[0].sample(batch_size, rng, now, then)
         shares = np.array([len(lane) for lane in self.lanes]) / len(self)
         counts = rng.multinomial(batch_size, shares)
+        firsts = np.cumsum(counts) - counts
         return _joined(
             [
-                lane.sample(int(count), rng)
-                for lane, count in zip(self.lanes, counts, strict=True)
+                lane.sample(count, rng, _from(first, now), _from(first, then))
+                for lane, count, first in zip(
+                    self.lanes, counts.tolist(), firsts.tolist(), strict=True
+                )
                 if count
             ]
         )
@@ -110,6 +125,15 @@ class Lanes:
         """
         for lane, its in zip(self.lanes, state.get("lanes", [state]), strict=True):
             lane.load_state_dict(its)
+
+
+def _from(first: int, copies: Copies | None) -> Copies | None:
+    """The copies for a part of the batch that begins with sample `first`."""
+
+    def of_part(copy: Copy) -> Copy:
+        return lambda sample, frames, out: copy(first + sample, frames, out)
+
+    return copies and {key: of_part(copy) for key, copy in copies.items()}
 
 
 def _joined(batches: list[Batch]) -> Batch:

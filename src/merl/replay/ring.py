@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import logging
 import mmap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from merl.core import Batch, MerlError, Observation, Transition, is_image
+from merl.core import Batch, Copies, Copy, MerlError, Observation, Transition, is_image
 from merl.replay.compression import CompressedPictures
 from merl.replay.config import ReplayConfig, check_fits, slots_for
 from merl.replay.journal import Journal
@@ -174,10 +174,22 @@ class Replay:
         self._forget()
         self._open = not transition.last
 
-    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+    def sample(
+        self,
+        batch_size: int,
+        rng: np.random.Generator,
+        now: Copies | None = None,
+        then: Copies | None = None,
+    ) -> Batch:
         """Draw steps uniformly, with replacement.
 
         The same content and the same state of `rng` give the same batch.
+
+        Args:
+            batch_size: B.
+            rng: draws.
+            now: how the frames of o_t are copied out, where not as they are.
+            then: likewise of o_{t+n}.
 
         Returns:
             Tensors on the CPU that are the caller's own; shapes as in `merl.core.Batch`.
@@ -195,11 +207,11 @@ class Replay:
         )
         self._read_ahead(picks)
         return Batch(
-            observation=self._observation(picks.now),
+            observation=self._observation(picks.now, now or {}),
             action=self._sampler.action(picks),
             reward=picks.reward,
             discount=picks.discount,
-            next_observation=self._observation(picks.then),
+            next_observation=self._observation(picks.then, then or {}),
         )
 
     @property
@@ -361,11 +373,42 @@ class Replay:
                 size = self._values[name].bytes
                 will_need(file, first * size, (last + 1) * size)
 
-    def _observation(self, slots: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _observation(self, slots: torch.Tensor, copies: Copies) -> dict[str, torch.Tensor]:
         """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""
         return {
-            key: torch.from_numpy(self._pictures[name].take(slots.numpy()))
-            if name in self._pictures
+            key: torch.from_numpy(self._stacks(name, slots.numpy(), copies.get(key, _as_it_is)))
+            if name in self._pictures or key in copies
             else self._sampler.observed(name, slots)
             for key, name in self.keys.items()
         }
+
+    def _stacks(self, name: str, slots: NDArray[np.int64], copy: Copy) -> NDArray[np.uint8]:
+        """Pictures at slots (B, K), copied stack by stack: (B, K, H, W, C)."""
+        stacks = np.empty((*slots.shape, *self._values[name].shape), np.uint8)
+        of = self._decoded(name, slots) if name in self._pictures else self._frames(name, slots)
+        for sample, (frames, out) in enumerate(zip(of, stacks, strict=True)):
+            copy(sample, frames, out)
+        return stacks
+
+    def _frames(self, name: str, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+        """Stack after stack, where it lies if it lies in one piece."""
+        ring = self._data[name]
+        in_one_piece = (np.diff(slots, axis=1) == 1).all(axis=1)
+        for first, last, these, whole in zip(
+            slots[:, 0].tolist(), slots[:, -1].tolist(), slots, in_one_piece.tolist(), strict=True
+        ):
+            yield ring[first : last + 1] if whole else ring[these]
+
+    def _decoded(self, name: str, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+        """Stack after stack, each in the place of the one before."""
+        pictures = self._pictures[name]
+        frames = np.empty((slots.shape[1], *pictures.shape), np.uint8)
+        flat = list(frames.reshape(len(frames), -1))
+        for spans in pictures.spans(slots):
+            for span, frame in zip(spans, flat, strict=True):
+                pictures.decode(span, frame)
+            yield frames
+
+
+def _as_it_is(_: int, frames: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
+    out[:] = frames

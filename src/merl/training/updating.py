@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from merl.agents.ddpg import DDPG
-from merl.core import Agent
 from merl.replay import Lanes
 from merl.replay.on_device import OnDevice, bytes_on_device
 from merl.training.config import TrainConfig
@@ -19,11 +19,22 @@ ROOM = 0.8
 
 
 def update_from_host(
-    agent: Agent, replay: Lanes, randomness: Randomness, config: TrainConfig
+    agent: DDPG, replay: Lanes, randomness: Randomness, config: TrainConfig
 ) -> Update:
-    """Batches drawn from the replay on the host, and brought over."""
-    size = config.replay.batch_size
-    return lambda: agent.update(replay.sample(size, randomness.batches))
+    """Batches drawn from the replay on the host, and brought over if need be.
+
+    On a CPU the random shift is made in the very copy that takes pictures out of the replay.
+    """
+    size, batches = config.replay.batch_size, randomness.batches
+
+    def update() -> dict[str, Tensor]:
+        if agent.device.type != "cpu":
+            return agent.update(replay.sample(size, batches))
+        draws = agent.draw(size)
+        batch = replay.sample(size, batches, *agent.copies(draws))
+        return agent.learn(batch, replace(draws, shifts={}, next_shifts={}))
+
+    return update
 
 
 def make_update(
@@ -96,7 +107,7 @@ class UpdateOnDevice:
 
     def _learn(self) -> dict[str, Tensor]:
         batch = self._copy.sample(self._batch_size, self._generator)
-        return self._agent.learn(batch, self._agent.draw(batch))
+        return self._agent.learn(batch, self._agent.draw(self._batch_size))
 
     def _learn_aside(self) -> dict[str, Tensor]:
         """On a stream of its own, as CUDA graphs want their warm-up."""

@@ -22,8 +22,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.replay import Lanes, Replay, ReplayConfig, check_fits, replay_bytes, ring
-from merl.replay.storage import will_need
+from merl.replay import Lanes, Replay, ReplayConfig, check_fits, replay_bytes, storage
+from merl.replay.storage import ReadAhead
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
 OBSERVATIONS = gymnasium.spaces.Dict(
@@ -264,7 +264,10 @@ def test_what_is_read_ahead_holds_every_picture_of_the_batch(tmp_path, monkeypat
         for t in range(8):
             write(replay, account, episode, t, Episode(7, "limit"))
     asked, picks, pick = [], [], replay._sampler.pick
-    monkeypatch.setattr(ring, "will_need", lambda _, *stretch: asked.append(stretch))
+    monkeypatch.setattr(replay._ahead, "ask", lambda _, *stretch: asked.append(stretch))
+    replay.sample(1, Every())
+    assert not asked  # all of it is in memory
+    monkeypatch.setattr(ReadAhead, "is_wanted", True)
     replay._sampler.pick = lambda *a, **k: (picks.append(pick(*a, **k)), picks[0])[1]
     replay.sample(1, Every())
     slots = torch.cat([picks[0].now, picks[0].then], dim=1).numpy()
@@ -282,6 +285,25 @@ def test_what_is_read_ahead_holds_every_picture_of_the_batch(tmp_path, monkeypat
         assert (end - begin)[in_one_piece].max() < 8 * (size + 64)
 
 
+def test_it_is_asked_for_some_time_after_pages_were_waited_for(monkeypatch):
+    waited = 0
+    monkeypatch.setattr(storage, "_pages_waited_for", lambda: waited)
+    ahead = ReadAhead()
+
+    def batch(pages):
+        nonlocal waited
+        wanted = ahead.is_wanted
+        ahead.begin()
+        waited += pages
+        ahead.end()
+        return wanted
+
+    assert [batch(pages) for pages in (0, 8, 9)] == [False] * 3
+    assert [batch(0) for _ in range(202)] == [True] * 200 + [False] * 2
+    batch(300)
+    assert [batch(9) for _ in range(500)] == [True] * 500
+
+
 def test_pictures_that_are_on_the_disk_alone_are_fetched(tmp_path):
     with (tmp_path / "pictures").open("w+b") as file:
         file.write(np.arange(10 * mmap.PAGESIZE // 8).tobytes())
@@ -289,7 +311,9 @@ def test_pictures_that_are_on_the_disk_alone_are_fetched(tmp_path):
         os.fsync(file.fileno())
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         with mmap.mmap(file.fileno(), 0) as mapped:
-            will_need(mapped, np.array([5000, 100, 9000]), np.array([9000, 50, 10 * mmap.PAGESIZE]))
+            ReadAhead.ask(
+                mapped, np.array([5000, 100, 9000]), np.array([9000, 50, 10 * mmap.PAGESIZE])
+            )
             assert np.array_equal(np.frombuffer(bytes(mapped), np.int64), np.arange(5120))
 
 

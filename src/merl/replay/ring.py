@@ -33,12 +33,12 @@ from merl.replay.config import ReplayConfig, check_fits, slots_for
 from merl.replay.journal import Journal
 from merl.replay.sampling import Picks, Sampler
 from merl.replay.storage import (
+    ReadAhead,
     check_value,
     field_name,
     fields_of,
     open_files,
     span_name,
-    will_need,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -116,6 +116,7 @@ class Replay:
         }
         self._data = arrays  # a row for each slot
         self._values = {**fields_of(observation_space, action_space)}  # what is written
+        self._ahead = ReadAhead()
         self._images = [n for key, n in self.keys.items() if is_image(observation_space[key])]
         self._journal: Journal | None = None
         if directory is not None:
@@ -205,14 +206,18 @@ class Replay:
             newest=torch.tensor([self._moments]),
             base=torch.tensor([0]),
         )
-        self._read_ahead(picks)
-        return Batch(
+        self._ahead.begin()
+        if self._ahead.is_wanted:
+            self._read_ahead(picks)
+        batch = Batch(
             observation=self._observation(picks.now, now or {}),
             action=self._sampler.action(picks),
             reward=picks.reward,
             discount=picks.discount,
             next_observation=self._observation(picks.then, then or {}),
         )
+        self._ahead.end()
+        return batch
 
     @property
     def compressed(self) -> bool:
@@ -360,18 +365,17 @@ class Replay:
         self._forget()
 
     def _read_ahead(self, picks: Picks) -> None:
-        """Have the pictures of a batch fetched that are on the disk alone.
+        """Ask for the pictures of a batch: a sample's lie in one piece but for where the ring ends.
 
-        So it is after a resumption, and wherever others use the memory. A sample's lie in one
-        piece, but for where the ring ends.
+        They are on the disk alone after a resumption, and wherever others use the memory.
         """
         first, last = picks.now[:, 0].numpy(), picks.then[:, -1].numpy()
         for name, file in self._files.items():
             if name in self._pictures:
-                will_need(file, *self._pictures[name].stretch(first, last))
+                self._ahead.ask(file, *self._pictures[name].stretch(first, last))
             elif name in self._images:
                 size = self._values[name].bytes
-                will_need(file, first * size, (last + 1) * size)
+                self._ahead.ask(file, first * size, (last + 1) * size)
 
     def _observation(self, slots: torch.Tensor, copies: Copies) -> dict[str, torch.Tensor]:
         """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""

@@ -27,19 +27,18 @@ import torch
 import tyro
 from rich.console import Console
 from torch import Tensor
+from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from merl.bench import train, update
 from merl.bench.measuring import circumstances, spread
+from merl.core import MerlError
 from merl.networks import augmentation, encoders
 from merl.networks.critic import TwinCritic
 from merl.replay.on_device import OnDevice
 from merl.training.parts import choose_device
-from merl.training.updating import UpdateOnDevice
-
-LAUNCHED_ONE_BY_ONE = 10**9
-"""Updates before a graph is recorded: never."""
+from merl.training.updating import Recorded, UpdateOnDevice
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Form:
 
     precision: Literal["bf16", "fp32"] = "bf16"
     compiled: bool = False
-    warm_up: int = UpdateOnDevice.WARM_UP
+    graph: bool = True
     change: Callable[[], AbstractContextManager[Any]] = nullcontext
 
 
@@ -84,7 +83,7 @@ def main(
         "gains": lambda: gains(agent, batch_size, updates, repeats),
         "profile": lambda: kernels(agent, batch_size),
         "update": lambda: shown(update, repeats=repeats, batch_size=batch_size),
-        "train": lambda: shown(train, repeats=min(repeats, 3)),
+        "train": lambda: loop(min(repeats, 3)),
     }.items():
         if name not in parts:
             continue
@@ -101,6 +100,15 @@ def shown(bench: Any, **asked: Any) -> Any:
     result = bench.run(**asked)
     Console().print(bench.table(result))
     return result
+
+
+def loop(repeats: int) -> Any:
+    """The whole loop, with pictures by rays where OpenGL is not to be had."""
+    try:
+        return shown(train, repeats=repeats)
+    except MerlError as error:
+        print(f"{error}: with preset laptop, by rays", file=sys.stderr)
+        return shown(train, repeats=repeats, preset="laptop")
 
 
 class Launches(TorchDispatchMode):
@@ -137,10 +145,9 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
     """Updates per second of every form, in turns."""
     forms = {
         "as it is": Form(),
-        "without a CUDA graph": Form(warm_up=LAUNCHED_ONE_BY_ONE),
+        "without a CUDA graph": Form(graph=False),
         "twin critics one by one": Form(change=lambda: patch.object(TwinCritic, "at_once", False)),
         "channels first": Form(change=channels_first),
-        "convolutions as cuDNN guesses": Form(change=guessed),
         "compiled": Form(compiled=True),
         "fp32": Form(precision="fp32"),
         "fp32, compiled": Form(precision="fp32", compiled=True),
@@ -158,7 +165,7 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
         for name, work in works.items():
             with forms[name].change():
                 rates[name].append(updates / seconds(work, updates))
-    whole = median(rates["as it is"])
+    whole = median(rates.get("as it is", [float("nan")]))
     for name, each in rates.items():
         print(f"| {name} | {median(each):,.1f} | {median(each) / whole:.2f} |")
     found = {name: spread(each) for name, each in rates.items()}
@@ -174,8 +181,9 @@ def work_of(agent: str, batch_size: int, form: Form) -> UpdateOnDevice:
             learner.networks.encoders.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
         replay = OnDevice([update.noise_replay()], device)
         work = UpdateOnDevice(learner, replay, batch_size, seed=0)
-        work.WARM_UP = form.warm_up  # type: ignore[misc]
-        for _ in range(UpdateOnDevice.WARM_UP + 2):
+        if not form.graph:
+            work._recorded.WARM_UP = sys.maxsize  # type: ignore[misc]
+        for _ in range(Recorded.WARM_UP + 2):
             work()
         wait()
     return work
@@ -183,13 +191,16 @@ def work_of(agent: str, batch_size: int, form: Form) -> UpdateOnDevice:
 
 def kernels(agent: str, batch_size: int, updates: int = 20) -> dict[str, Any]:
     """What an update consists of, longest first; on a GPU kernels, else operations."""
-    work = work_of(agent, batch_size, Form())
     on_gpu = torch.cuda.is_available()
+    # Times inside a graph are not to be trusted everywhere: its kernels, launched one by one.
+    work = work_of(agent, batch_size, Form(graph=False))
     kind = ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU
     with profile(activities=[kind]) as profiled:
         seconds(work, updates)
     rows = []
     for event in profiled.key_averages():
+        if on_gpu and event.device_type != DeviceType.CUDA:
+            continue  # what the host did
         own = event.self_device_time_total if on_gpu else event.self_cpu_time_total
         rows.append((own / updates, event.count / updates, event.key))
     rows.sort(reverse=True)
@@ -226,16 +237,6 @@ def channels_first() -> Iterator[None]:
 
     with patch.object(encoders, "to_input", contiguous):
         yield
-
-
-@contextmanager
-def guessed() -> Iterator[None]:
-    """Ways to convolve that are not timed first."""
-    torch.backends.cudnn.benchmark = False
-    try:
-        yield
-    finally:
-        torch.backends.cudnn.benchmark = True
 
 
 if __name__ == "__main__":

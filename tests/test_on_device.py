@@ -97,6 +97,18 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
     assert ((often - 2000.0) ** 2 / 2000.0).sum() < 52
 
 
+def test_what_memory_held_before_is_never_learnt_from() -> None:
+    """A card's memory is not empty when the copy takes it, and may hold what is no number."""
+    ring = make(capacity=50)
+    copy = OnDevice([ring], torch.device("cpu"))
+    for field in copy._fields.values():
+        if field.is_floating_point():
+            field.fill_(torch.nan)
+    for _ in writing(ring, 0, [Episode(20, "limit"), Episode(9, "cut")]):
+        copy.follow()
+        check(copy, [ring])
+
+
 def test_a_draw_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a device without values: what asked for one, or lay elsewhere, would raise."""
     ring, card, rand = make(capacity=20), torch.device("meta"), torch.rand

@@ -17,7 +17,7 @@ from merl.training.acting import Here
 from merl.training.config import TrainConfig
 from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train
 from merl.training.rollout import Episode, Fetched, FrameStack
-from merl.training.updating import UpdateOnDevice, update_from_host
+from merl.training.updating import UpdateFromHost, UpdateOnDevice, update_from_host
 from toy import DotEnv
 
 CPU = torch.device("cpu")
@@ -238,3 +238,14 @@ def test_on_the_device_the_same_is_learnt_from_the_same_batch(agent: MERLConfig)
         parts.agent.networks.parameters(), twin.networks.parameters(), strict=True
     ):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("agent", NOISES, ids=["fixed", "scheduled"])
+def test_from_a_batch_that_is_brought_over_the_same_is_learnt(agent: MERLConfig) -> None:
+    """What a GPU does that does not hold the replay, on the CPU."""
+    parts, twin = (Parts(dataclasses.replace(CONFIG, agent=agent)) for _ in range(2))
+    replay, batches = parts.replay, parts.randomness.batches
+    parts.update = UpdateFromHost(parts.agent, lambda: replay.sample(8, batches))
+    for each in (parts, twin):
+        assert each.run()[-1].updates == 40
+    assert torch.equal(parts.weights(), twin.weights())

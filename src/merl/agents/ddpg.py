@@ -297,6 +297,10 @@ class DDPG:
         parts += self.critic_target.values()
         if self.device.type == "cuda":  # on a CPU convolutions are no faster for it
             parts += networks.encoders.images.values()
+        from torch._functorch import config as compiling
+
+        # Each gradient in the precision of what it is of, as without, not all in autocast's.
+        compiling.backward_pass_autocast = "off"
         for part in parts:
             part.compile(dynamic=False)
 

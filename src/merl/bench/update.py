@@ -24,7 +24,8 @@ from merl.bench.plain import Encoder, Plain, Sample
 from merl.core import Batch, MerlError, Transition
 from merl.replay import Replay, ReplayConfig
 from merl.replay.on_device import OnDevice
-from merl.training.updating import UpdateOnDevice
+from merl.training.parts import choose_device
+from merl.training.updating import Recorded, UpdateOnDevice
 
 SIDE, STACK, PROPRIO, ACTIONS, LAYERS = 84, 3, 24, 9, 6
 REFERENCE, OURS, DRQV2, OUR_DRQV2, SB3 = (
@@ -60,7 +61,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
         within each round), each as `median`, `low` and `high` over the rounds; `skipped`, why a
         side is missing; the circumstances.
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = choose_device("auto")
     on_gpu = device.type == "cuda"
     times = UPDATES_ON_GPU if on_gpu else 1
 
@@ -91,7 +92,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
                 update = UpdateOnDevice(
                     learner_of(agent, precision, device), replay, batch_size, seed=0
                 )
-                for _ in range(UpdateOnDevice.WARM_UP):
+                for _ in range(Recorded.WARM_UP):
                     update()
                 sides[name], of[name] = repeated(update), reference
     try:

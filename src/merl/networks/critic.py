@@ -56,20 +56,40 @@ def twins(first: MLP, second: MLP, x: Tensor) -> tuple[Tensor, Tensor]:
     )
     x = x.expand(2, *x.shape)
     for layer in first.hidden:
-        x = _products(x, next(linear), next(linear)).to(own)
+        x = _both(x, next(linear), next(linear)).to(own)
         if isinstance(layer.norm, nn.LayerNorm):
             x = functional.layer_norm(x, layer.norm.normalized_shape, eps=layer.norm.eps)
             scale, offset = next(exact)[:, None], next(exact)[:, None]
             x = torch.addcmul(offset, x, scale)
         x = torch.relu(x)
     with torch.autocast(x.device.type, enabled=False):
-        q1, q2 = _products(x, next(exact), next(exact))
+        q1, q2 = _both(x, next(exact), next(exact))
     return q1, q2
 
 
-def _products(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """(2, B, n) by (2, m, n) to (2, B, m)."""
-    return torch.baddbmm(bias[:, None], x, weight.transpose(1, 2))
+def _both(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Two linear layers: (2, B, n) by (2, m, n) to (2, B, m), in the precision of the weights."""
+    layers: Tensor = _Linears.apply(x.to(weight.dtype), weight, bias)  # type: ignore[no-untyped-call]
+    return layers
+
+
+class _Linears(torch.autograd.Function):
+    """As `baddbmm`, but for gradients that lie as the weights do: they need no copy to be taken."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(x, weight)
+        return torch.baddbmm(bias[:, None], x, weight.mT)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (g,), (x, weight) = gradients, ctx.saved_tensors
+        of_x, of_weight, of_bias = ctx.needs_input_grad
+        return (
+            g @ weight if of_x else None,
+            g.mT @ x if of_weight else None,
+            g.sum(dim=1) if of_bias else None,
+        )
 
 
 def _side_by_side(

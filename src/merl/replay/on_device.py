@@ -54,12 +54,16 @@ class OnDevice:
         self._sources = torch.zeros(len(rings) * self._capacity, dtype=torch.int64, device=device)
         # Of each ring: its first step that can be sampled, its steps and its moments so far.
         self._counts = torch.zeros((len(rings), 3), dtype=torch.int64, device=device)
+        self._told = torch.zeros_like(self._counts, device="cpu")
         self._there = [(0, 0)] * len(rings)  # moments and steps that were brought over
         self._sampler = Sampler(self._fields, self._slots, first.config)
 
     def follow(self) -> None:
         """Bring over what the rings have taken in since the last time."""
         counts = torch.tensor([ring.counts() for ring in self._rings])
+        if torch.equal(counts, self._told):
+            return
+        self._told = counts
         for index, (ring, (_, steps, moments)) in enumerate(
             zip(self._rings, counts.tolist(), strict=True)
         ):

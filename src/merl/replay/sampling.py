@@ -67,7 +67,9 @@ class Sampler:
         same = ((ahead <= newest) & (fields["position"][slots] > 0)).long().cumprod(dim=1)
         steps = same.sum(dim=1)  # (B,): m
         end = moments + steps[:, None]
-        rewards = fields["reward"][slots] * same * self._powers[:-1]  # float64
+        # Slots beyond the newest moment may never have been written: no number times 0 is none.
+        paid = torch.where(same.bool(), fields["reward"][slots], 0.0)
+        rewards = paid * self._powers[:-1]  # float64
         last = fields["discount"][self._slot(end, base)[:, 0]]
         return Picks(
             now=self._slot(torch.maximum(moments - self._back, begun), base),

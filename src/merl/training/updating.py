@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from merl.agents.ddpg import DDPG
+from merl.core import Batch
 from merl.replay import Lanes
 from merl.replay.on_device import OnDevice, bytes_on_device
 from merl.training.config import TrainConfig
@@ -21,15 +22,13 @@ ROOM = 0.8
 def update_from_host(
     agent: DDPG, replay: Lanes, randomness: Randomness, config: TrainConfig
 ) -> Update:
-    """Batches drawn from the replay on the host, and brought over if need be.
+    """Batches drawn from the replay on the host, for an agent on the CPU.
 
-    On a CPU the random shift is made in the very copy that takes pictures out of the replay.
+    The random shift is made in the very copy that takes pictures out of the replay.
     """
     size, batches = config.replay.batch_size, randomness.batches
 
     def update() -> dict[str, Tensor]:
-        if agent.device.type != "cpu":
-            return agent.update(replay.sample(size, batches))
         draws = agent.draw(size)
         batch = replay.sample(size, batches, *agent.copies(draws))
         return agent.learn(batch, replace(draws, shifts={}, next_shifts={}))
@@ -61,28 +60,31 @@ def make_update(
         else:
             copy = OnDevice(replay.lanes, agent.device)
             return UpdateOnDevice(agent, copy, config.replay.batch_size, randomness.device)
+        size = config.replay.batch_size
+        return UpdateFromHost(agent, lambda: replay.sample(size, randomness.batches))
     return update_from_host(agent, replay, randomness, config)
 
 
-class UpdateOnDevice:
-    """Draws a batch from a copy of the replay and learns from it, without asking the host.
-
-    On a GPU the whole update, from the draw to the target's average, is recorded once, after
-    `WARM_UP` updates, and is one CUDA graph from then on.
+class Recorded:
+    """An update without the host: on a GPU recorded as a CUDA graph, from then on a single launch.
 
     Args:
         agent: the learner.
-        copy: of the replay, on its device.
-        batch_size: B.
-        seed: of what is drawn.
+        batch: gives what is learnt from, on the agent's device, by the same operations every time.
+        generators: the device's, that `batch` draws from.
     """
 
     WARM_UP = 3
+    """Updates before it is recorded."""
 
-    def __init__(self, agent: DDPG, copy: OnDevice, batch_size: int, seed: int) -> None:
-        self._agent, self._copy, self._batch_size = agent, copy, batch_size
-        self._generator = torch.Generator(agent.device).manual_seed(seed)
-        agent.sigma = torch.zeros((), device=agent.device)
+    def __init__(
+        self, agent: DDPG, batch: Callable[[], Batch], generators: Sequence[torch.Generator] = ()
+    ) -> None:
+        self._agent, self._batch = agent, batch
+        self._generators = (*generators, agent.learning)
+        self._sigma = agent.sigma = torch.zeros((), device=agent.device)
+        self._on_gpu = agent.device.type == "cuda"
+        self._aside = torch.cuda.Stream() if self._on_gpu else None  # type: ignore[no-untyped-call]
         self._graph: torch.cuda.CUDAGraph | None = None
         self._names: tuple[str, ...] = ()
         self._values: Tensor | None = None
@@ -90,12 +92,9 @@ class UpdateOnDevice:
 
     def __call__(self) -> dict[str, Tensor]:
         """One update; returns its metrics, scalars on the device."""
-        agent = self._agent
-        assert agent.sigma is not None
-        self._copy.follow()
-        agent.sigma.fill_(agent.config.noise(agent.step))
+        self._sigma.fill_(self._agent.config.noise(self._agent.step))
         self._made += 1
-        if agent.device.type != "cuda":
+        if not self._on_gpu:
             return self._learn()
         if self._made <= self.WARM_UP:
             return self._learn_aside()
@@ -106,24 +105,84 @@ class UpdateOnDevice:
         return dict(zip(self._names, self._values.clone().unbind(), strict=True))
 
     def _learn(self) -> dict[str, Tensor]:
-        batch = self._copy.sample(self._batch_size, self._generator)
-        return self._agent.learn(batch, self._agent.draw(self._batch_size))
+        batch = self._batch()
+        return self._agent.learn(batch, self._agent.draw(len(batch.action)))
 
     def _learn_aside(self) -> dict[str, Tensor]:
         """On a stream of its own, as CUDA graphs want their warm-up."""
-        aside = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-        aside.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(aside):
+        assert self._aside is not None
+        self._aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._aside):
             told = self._learn()
-        torch.cuda.current_stream().wait_stream(aside)
+        torch.cuda.current_stream().wait_stream(self._aside)
         return told
 
     def _record(self) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
-        for generator in (self._generator, self._agent.learning):
+        for generator in self._generators:
             graph.register_generator_state(generator)
         with torch.cuda.graph(graph):
             told = self._learn()
             self._values = torch.stack([value.float() for value in told.values()])
         self._names = tuple(told)
         return graph
+
+
+class UpdateOnDevice:
+    """Draws a batch from a copy of the replay and learns from it, without asking the host.
+
+    Args:
+        agent: the learner.
+        copy: of the replay, on its device.
+        batch_size: B.
+        seed: of what is drawn.
+    """
+
+    def __init__(self, agent: DDPG, copy: OnDevice, batch_size: int, seed: int) -> None:
+        generator = torch.Generator(agent.device).manual_seed(seed)
+        self._copy = copy
+        self._recorded = Recorded(agent, lambda: copy.sample(batch_size, generator), [generator])
+
+    def __call__(self) -> dict[str, Tensor]:
+        """One update; returns its metrics, scalars on the device."""
+        self._copy.follow()
+        return self._recorded()
+
+
+class UpdateFromHost:
+    """Draws a batch from the replay on the host and brings it to where the agent is.
+
+    Args:
+        agent: the learner, on a GPU.
+        draw: gives a batch on the host, always of the same shape.
+    """
+
+    def __init__(self, agent: DDPG, draw: Callable[[], Batch]) -> None:
+        self._draw, self._device = draw, agent.device
+        self._there: Batch | None = None  # what the graph reads
+        self._recorded = Recorded(agent, self._batch)
+
+    def __call__(self) -> dict[str, Tensor]:
+        """One update; returns its metrics, scalars on the device."""
+        batch = self._draw()
+        if self._there is None:
+            self._there = batch.to(self._device)
+        else:
+            _overwrite(self._there, batch)
+        return self._recorded()
+
+    def _batch(self) -> Batch:
+        assert self._there is not None
+        return self._there
+
+
+def _overwrite(there: Batch, batch: Batch) -> None:
+    """Bring a batch to where another lies, without waiting for what a GPU is at."""
+    for old, new in zip(_tensors(there), _tensors(batch), strict=True):
+        old.copy_(new.pin_memory() if old.is_cuda else new, non_blocking=True)
+
+
+def _tensors(batch: Batch) -> list[Tensor]:
+    observations = (batch.observation, batch.next_observation)
+    pictures = [value for each in observations for value in each.values()]
+    return [*pictures, batch.action, batch.reward, batch.discount]

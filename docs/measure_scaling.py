@@ -36,6 +36,7 @@ from merl.bench.train import steps_per_second
 from merl.bench.update import ACTIONS, learner_of, noise_batch, space_of
 from merl.core import Transition
 from merl.envs import make_env
+from merl.networks.augmentation import Crop, draw_shifts
 from merl.replay import Replay, ReplayConfig, replay_bytes, ring, storage
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
 from merl.resources import free_disk
@@ -48,6 +49,7 @@ BATCHES = (16, 32, 64, 128, 256, 512)
 SIDES = (32, 48, 64, 84, 100, 128)
 ENVIRONMENTS = (1, 2, 3, 4)
 CAPACITIES = (1000, 10_000, 100_000, 300_000, 1_000_000, 1_500_000)
+PAD = 4
 SAMPLES = 20
 """Batches of a turn, where a replay is sampled."""
 EPISODE = 250
@@ -119,7 +121,7 @@ def environments(repeats: int) -> Iterator[Row]:
 
 
 def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
-    """Milliseconds to sample 256 pairs, by the steps in the replay; each replay by itself.
+    """Milliseconds to sample and shift 256 pairs, by the steps held; each replay by itself.
 
     Also those that do not fit into memory, which merl refuses: check and reading ahead are taken
     away here to show what they are for.
@@ -144,8 +146,10 @@ def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
 
 
 def _samples(replay: Replay, rng: np.random.Generator) -> None:
+    shifts = torch.Generator().manual_seed(0)
     for _ in range(SAMPLES):
-        replay.sample(256, rng)
+        now, then = (Crop(draw_shifts(256, PAD, shifts), PAD) for _ in range(2))
+        replay.sample(256, rng, {"image": now}, {"image": then})
 
 
 def _as_touched(sample: Work) -> None:

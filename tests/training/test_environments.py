@@ -16,7 +16,7 @@ from torch import Tensor
 from worker_envs import WORK
 
 from merl import cli
-from merl.agents.ddpg import DDPG
+from merl.agents.ddpg import DDPG, Draws
 from merl.core import Batch
 from merl.report.curves import read_metrics
 from merl.training.checkpoint import Checkpoint
@@ -237,13 +237,13 @@ def test_environments_step_while_the_learner_learns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An environment that waits 20 ms a step costs little beside updates that wait 20 ms more."""
-    update = DDPG.update
+    learn = DDPG.learn
 
-    def slow_update(self: DDPG, batch: Batch) -> dict[str, Tensor]:
+    def slowly(self: DDPG, batch: Batch, draws: Draws) -> dict[str, Tensor]:
         time.sleep(WORK)
-        return update(self, batch)
+        return learn(self, batch, draws)
 
-    monkeypatch.setattr(DDPG, "update", slow_update)
+    monkeypatch.setattr(DDPG, "learn", slowly)
     seconds = {}
     for name, flags in {"waits": [], "overlaps": ["--no-synchronous"]}.items():
         assert train(tmp_path / name, "slow", "--updates-per-step", "1", *flags) == 0

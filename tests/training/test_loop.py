@@ -71,9 +71,9 @@ def test_the_agent_is_told_the_step() -> None:
     """On which its noise depends, when acting and when learning."""
     agent = dataclasses.replace(CONFIG.agent, noise_std=1.0, noise_std_end=0.0, noise_steps=60)
     parts = Parts(dataclasses.replace(CONFIG, agent=agent, action_repeat=2))
-    act, update, told = parts.agent.act, parts.agent.update, []
+    act, learn, told = parts.agent.act, parts.agent.learn, []
     parts.agent.act = lambda *a, **k: (told.append(parts.agent.step), act(*a, **k))[1]  # type: ignore[method-assign]
-    parts.agent.update = lambda b: (told.append(parts.agent.step), update(b))[1]  # type: ignore[method-assign]
+    parts.agent.learn = lambda b, d: (told.append(parts.agent.step), learn(b, d))[1]  # type: ignore[method-assign]
     parts.run()
     assert told[:4] == [10, 12, 14, 16]  # a step of the loop is two of the environment
     assert max(told) == 58

@@ -94,18 +94,17 @@ def to_input(images: Tensor, dtype: torch.dtype) -> Tensor:
     weights (`encoders.ConvEncoder`). The memory is in channels-last order, which convolutions are
     fastest with.
     """
-    centred = _interleaved(images).bitwise_xor(128).view(torch.int8)  # of a byte: less 128
-    return centred.flatten(3).to(dtype).permute(0, 3, 1, 2)
+    return _centred(images).view(torch.int8).flatten(3).to(dtype).permute(0, 3, 1, 2)
 
 
-def _interleaved(images: Tensor) -> Tensor:
-    """(B, K, H, W, C) to (B, H, W, K, C), where the channels of a pixel lie side by side."""
-    if images.device.type != "cpu":  # the shift leaves them so already
-        return images.permute(0, 2, 3, 1, 4).contiguous()
+def _centred(images: Tensor) -> Tensor:
+    """(B, K, H, W, C) to (B, H, W, K, C), a pixel's channels side by side, each byte less 128."""
+    if images.device.type != "cpu":  # the shift leaves them in this order already
+        return images.permute(0, 2, 3, 1, 4).contiguous().bitwise_xor(128)
     batch, stack, height, width, channels = images.shape
     interleaved = images.new_empty((batch, height, width, stack, channels))
     # A copy per channel runs along whole images; one permuted copy would run along three bytes.
     for frame in range(stack):
         for channel in range(channels):
             interleaved[..., frame, channel] = images[:, frame, ..., channel]
-    return interleaved
+    return interleaved.bitwise_xor_(128)

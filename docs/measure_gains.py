@@ -43,7 +43,7 @@ def main(precision: Literal["bf16", "fp32"] = "bf16", repeats: int = 5) -> None:
             encoders.ConvEncoder, "forward", scale_pixels
         ),
         "channels first": channels_first,
-        "gradients of all weights": lambda _: patch.object(ddpg, "step_optimizer", step_all),
+        "gradients of all weights": lambda _: gradients_of_all(),
         "Adam weight by weight": weight_by_weight,
     }
     agents = {name: learner_of("merl", precision, torch.device("cpu")) for name in changes}
@@ -92,6 +92,16 @@ def scale_pixels(encoder: encoders.ConvEncoder, stacks: Tensor) -> Tensor:
     scaled = whole.add_(128).mul_(1 / 255).sub_(0.5)
     maps: Tensor = encoder.convolutions(scaled)
     return maps.permute(0, 2, 3, 1).flatten(1)
+
+
+@contextmanager
+def gradients_of_all() -> Iterator[None]:
+    """Also the critic's, of the actor's loss."""
+    with (
+        patch.object(ddpg, "step_optimizer", step_all),
+        patch.object(ddpg, "frozen", lambda _: nullcontext()),
+    ):
+        yield
 
 
 def step_all(optimizer: torch.optim.Optimizer, loss: Tensor, _: Any) -> None:

@@ -251,7 +251,7 @@ def wait_for(condition, seconds: float = 120) -> None:  # type: ignore[no-untype
 
 
 BAD = {
-    "evaluate some-run --video film.gif": "film.mp4",
+    "evaluate some-run --video films/a.gif": "films/a.mp4",
     "train": "missing from merl train: TASK",
     "train reach_dulpo": "did you mean 'reach_duplo'",
     "train reach_duplo --stepz 4": "did you mean --steps",

@@ -144,7 +144,7 @@ class Batch:
 
 
 class Agent(Protocol):
-    """What the training loop asks of a learner.
+    """What those who do not know the learner ask of it: acting, evaluating, saving.
 
     Attributes:
         step: environment steps so far, on which exploration may depend; set by who drives it.

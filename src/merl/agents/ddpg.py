@@ -297,10 +297,12 @@ class DDPG:
         parts += self.critic_target.values()
         if self.device.type == "cuda":  # on a CPU convolutions are no faster for it
             parts += networks.encoders.images.values()
-        from torch._functorch import config as compiling
+        from torch._dynamo import config as dynamo
+        from torch._functorch import config as functorch
 
         # Each gradient in the precision of what it is of, as without, not all in autocast's.
-        compiling.backward_pass_autocast = "off"
+        functorch.backward_pass_autocast = "off"
+        dynamo.recompile_limit = 64  # precisions and threads are tried out: each needs its own
         for part in parts:
             part.compile(dynamic=False)
 

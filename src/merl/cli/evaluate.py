@@ -44,7 +44,7 @@ class EvaluateOptions:
             raise MerlError(f"--episodes must be at least 1, not {self.episodes}")
         if self.video is not None and self.video.suffix.lower() not in ("", ".mp4"):
             raise MerlError(
-                f"--video {self.video}: videos are MP4; use {self.video.with_suffix('.mp4').name}"
+                f"--video {self.video}: videos are MP4; use {self.video.with_suffix('.mp4')}"
             )
 
 

@@ -7,13 +7,11 @@ import os
 import sys
 import tempfile
 import threading
-import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from copy import copy
 from functools import cache
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -35,7 +33,7 @@ class WarpRenderer:
         self._mjw = _start_warp()
         self._source = physics.data.ptr
         model = physics.model.ptr
-        with _warp_on_cpu():
+        with _warp_on_cpu(), _told_if_it_takes_long():
             self._model = self._mjw.put_model(model)
             self._data = self._mjw.put_data(model, self._source)
             self._context = self._mjw.create_render_context(
@@ -53,8 +51,6 @@ class WarpRenderer:
             )
             # Compiled with the first picture, and kept by the context that its parts are copies of.
             self._mjw.render(self._model, self._data, self._context)
-            with suppress(OSError):
-                _compiled().touch()
         # Views, not copies: on the CPU numpy and Warp share the memory.
         self._poses = {name: getattr(self._data, name).numpy()[0] for name in _POSES}
         self._bgra = self._context.rgb_data.numpy().view(np.uint8).reshape(size, size, 4)
@@ -136,23 +132,26 @@ def _start_warp() -> Any:
             flags = warp.config.cpu_compiler_flags
             own = "-march=native" if flags is None else flags  # None: for this processor, too
             warp.config.cpu_compiler_flags = f"{own} {_COMPILER_FLAGS}"
-            if not _compiled().exists():
-                print("merl: compiling the ray tracer, once, for about 15 s", file=sys.stderr)
             with _silent_stderr():  # without an NVIDIA driver Warp says so, past Python
                 warp.init()  # type: ignore[no-untyped-call]
         return importlib.import_module("mujoco_warp")
 
 
-def _compiled() -> Path:
-    """The file that is there once the ray tracer was compiled by this Warp in this way."""
-    import warp
+@contextmanager
+def _told_if_it_takes_long(seconds: float = 2.0) -> Iterator[None]:
+    """Say that the ray tracer is being compiled: what is compiled already is there in less time."""
+    notice = threading.Timer(
+        seconds,
+        lambda: print("merl: compiling the ray tracer, once, for 5 to 20 s", file=sys.stderr),
+    )
+    notice.daemon = True
+    notice.start()
+    try:
+        yield
+    finally:
+        notice.cancel()
 
-    way = f"{version('mujoco-warp')} {warp.config.cpu_compiler_flags}"
-    name = f"merl-{warp.__version__}-{zlib.crc32(way.encode()):08x}"
-    return _kernel_cache() / name
 
-
-@cache
 def _kernel_cache() -> Path:
     """A folder of our own that can be written: in the user's cache, else among temporary files."""
     places = [Path(tempfile.gettempdir()) / f"merl-warp-{os.getuid()}"]

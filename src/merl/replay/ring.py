@@ -369,7 +369,13 @@ class Replay:
 
         They are on the disk alone after a resumption, and wherever others use the memory.
         """
-        first, last = picks.now[:, 0].numpy(), picks.then[:, -1].numpy()
+        now, then = picks.now.numpy(), picks.then.numpy()
+        near = self.config.n_step <= self.config.frame_stack  # o_t and o_{t+n} touch
+        for first, last in [(now, then)] if near else [(now, now), (then, then)]:
+            self._ask(first[:, 0], last[:, -1])
+
+    def _ask(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> None:
+        """For the pictures from some slots to others."""
         for name, file in self._files.items():
             if name in self._pictures:
                 self._ahead.ask(file, *self._pictures[name].stretch(first, last))

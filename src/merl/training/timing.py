@@ -178,9 +178,9 @@ def _time_update(agent: DDPG, batch: Batch) -> float:
     except Exception as error:
         if not agent.config.compile:
             raise
-        reason = str(error).strip().splitlines()[0]
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise MerlError(
-            f"--agent.compile: torch cannot compile the networks here ({reason}): leave it out"
+            f"--agent.compile: the compiled update fails here ({reason}): leave it out"
         ) from error
     return _median_seconds(update)
 

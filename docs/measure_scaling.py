@@ -37,7 +37,7 @@ from merl.bench.update import ACTIONS, learner_of, noise_batch, space_of
 from merl.core import Transition
 from merl.envs import make_env
 from merl.networks.augmentation import Crop, draw_shifts
-from merl.replay import Replay, ReplayConfig, replay_bytes, ring, storage
+from merl.replay import Replay, ReplayConfig, pictures, replay_bytes, ring
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
 from merl.resources import free_disk
 from merl.training.timing import use_threads
@@ -153,7 +153,7 @@ def _samples(replay: Replay, rng: np.random.Generator) -> None:
 
 
 def _as_touched(sample: Work) -> None:
-    with patch.object(storage.ReadAhead, "is_wanted", False):
+    with patch.object(pictures.ReadAhead, "is_wanted", False):
         sample()
 
 

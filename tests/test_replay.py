@@ -24,8 +24,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.replay import Lanes, Replay, ReplayConfig, check_fits, replay_bytes, storage
-from merl.replay.storage import ReadAhead
+from merl.replay import Lanes, Replay, ReplayConfig, check_fits, pictures, replay_bytes
+from merl.replay.pictures import ReadAhead
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
 OBSERVATIONS = gymnasium.spaces.Dict(
@@ -289,7 +289,7 @@ def test_what_is_read_ahead_holds_every_picture_of_the_batch(tmp_path, monkeypat
 
 def test_it_is_asked_for_some_time_after_pages_were_waited_for(monkeypatch):
     waited = 0
-    monkeypatch.setattr(storage, "_pages_waited_for", lambda: waited)
+    monkeypatch.setattr(pictures, "_pages_waited_for", lambda: waited)
     ahead = ReadAhead()
 
     def batch(pages):

@@ -9,6 +9,7 @@ bytes; where they need more than was reserved, the ring holds fewer steps.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -96,22 +97,21 @@ class CompressedPictures:
     def stretch(
         self, first: NDArray[np.int64], last: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Where the bytes from one slot's picture to another's begin and end, of many such pairs.
-
-        Where the ring's end lies between the two, the end comes before the beginning.
-        """
+        """See `pictures.Pictures`."""
         begin, (end, count) = self._spans[first, 0], self._spans[last].T
         length = len(self._ring)
         return begin % length, end % length + count
 
-    def spans(self, slots: NDArray[np.int64]) -> list[Any]:
-        """Where the pictures of slots (...) lie, for `decode`: nested lists of that shape."""
-        spans: list[Any] = self._spans[slots].tolist()
-        return spans
+    def stacks(self, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+        """See `pictures.Pictures`: each is decoded into the place of the one before."""
+        frames = np.empty((slots.shape[1], *self.shape), np.uint8)
+        flat = list(frames.reshape(len(frames), -1))
+        for spans in self._spans[slots].tolist():
+            for (begin, count), frame in zip(spans, flat, strict=True):
+                self._decode(begin, count, frame)
+            yield frames
 
-    def decode(self, span: tuple[int, int], out: NDArray[np.uint8]) -> None:
-        """A picture, into its bytes (H W C,)."""
-        begin, count = span
+    def _decode(self, begin: int, count: int, out: NDArray[np.uint8]) -> None:
         at, kept = begin % len(self._ring), self._ring.data
         difference = lz4.block.decompress(kept[at + 1 : at + count], uncompressed_size=self._size)
         np.add(np.frombuffer(difference, np.uint8), self._backgrounds[kept[at]], out=out)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import logging
 import mmap
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from merl.core import Batch, Copies, Copy, MerlError, Observation, Transition, is_image
+from merl.core import Batch, Copies, MerlError, Observation, Transition, is_image
 from merl.replay.compression import CompressedPictures
 from merl.replay.config import ReplayConfig, check_fits, slots_for
 from merl.replay.journal import Journal
+from merl.replay.pictures import Pictures, RawPictures, ReadAhead, as_it_is, copied
 from merl.replay.sampling import Picks, Sampler
 from merl.replay.storage import (
-    ReadAhead,
     check_value,
     field_name,
     fields_of,
@@ -117,7 +117,11 @@ class Replay:
         self._data = arrays  # a row for each slot
         self._values = {**fields_of(observation_space, action_space)}  # what is written
         self._ahead = ReadAhead()
-        self._images = [n for key, n in self.keys.items() if is_image(observation_space[key])]
+        self._images: dict[str, Pictures] = {
+            name: self._pictures[name] if name in self._pictures else RawPictures(arrays[name])
+            for key, name in self.keys.items()
+            if is_image(observation_space[key])
+        }
         self._journal: Journal | None = None
         if directory is not None:
             self._journal = Journal(directory, self._data, self._pictures)
@@ -207,7 +211,7 @@ class Replay:
             base=torch.tensor([0]),
         )
         self._ahead.begin()
-        if self._ahead.is_wanted:
+        if self._files and self._ahead.is_wanted:
             self._read_ahead(picks)
         batch = Batch(
             observation=self._observation(picks.now, now or {}),
@@ -372,53 +376,16 @@ class Replay:
         now, then = picks.now.numpy(), picks.then.numpy()
         near = self.config.n_step <= self.config.frame_stack  # o_t and o_{t+n} touch
         for first, last in [(now, then)] if near else [(now, now), (then, then)]:
-            self._ask(first[:, 0], last[:, -1])
-
-    def _ask(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> None:
-        """For the pictures from some slots to others."""
-        for name, file in self._files.items():
-            if name in self._pictures:
-                self._ahead.ask(file, *self._pictures[name].stretch(first, last))
-            elif name in self._images:
-                size = self._values[name].bytes
-                self._ahead.ask(file, first * size, (last + 1) * size)
+            for name, pictures in self._images.items():
+                self._ahead.ask(self._files[name], *pictures.stretch(first[:, 0], last[:, -1]))
 
     def _observation(self, slots: torch.Tensor, copies: Copies) -> dict[str, torch.Tensor]:
         """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""
         return {
-            key: torch.from_numpy(self._stacks(name, slots.numpy(), copies.get(key, _as_it_is)))
+            key: torch.from_numpy(
+                copied(self._images[name], slots.numpy(), copies.get(key, as_it_is))
+            )
             if name in self._pictures or key in copies
             else self._sampler.observed(name, slots)
             for key, name in self.keys.items()
         }
-
-    def _stacks(self, name: str, slots: NDArray[np.int64], copy: Copy) -> NDArray[np.uint8]:
-        """Pictures at slots (B, K), copied stack by stack: (B, K, H, W, C)."""
-        stacks = np.empty((*slots.shape, *self._values[name].shape), np.uint8)
-        of = self._decoded(name, slots) if name in self._pictures else self._frames(name, slots)
-        for sample, (frames, out) in enumerate(zip(of, stacks, strict=True)):
-            copy(sample, frames, out)
-        return stacks
-
-    def _frames(self, name: str, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-        """Stack after stack, where it lies if it lies in one piece."""
-        ring = self._data[name]
-        in_one_piece = (np.diff(slots, axis=1) == 1).all(axis=1)
-        for first, last, these, whole in zip(
-            slots[:, 0].tolist(), slots[:, -1].tolist(), slots, in_one_piece.tolist(), strict=True
-        ):
-            yield ring[first : last + 1] if whole else ring[these]
-
-    def _decoded(self, name: str, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-        """Stack after stack, each in the place of the one before."""
-        pictures = self._pictures[name]
-        frames = np.empty((slots.shape[1], *pictures.shape), np.uint8)
-        flat = list(frames.reshape(len(frames), -1))
-        for spans in pictures.spans(slots):
-            for span, frame in zip(spans, flat, strict=True):
-                pictures.decode(span, frame)
-            yield frames
-
-
-def _as_it_is(_: int, frames: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
-    out[:] = frames

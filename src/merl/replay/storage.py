@@ -13,7 +13,6 @@ import json
 import math
 import mmap
 import os
-import resource
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,7 +22,6 @@ from urllib.parse import quote
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from merl.core import MerlError, is_image, is_vector
 from merl.replay.compression import reserved_bytes
@@ -138,55 +136,6 @@ def open_files(
             raise MerlError(f"cannot keep a replay in {directory}: {why}") from error
         raise
     return files
-
-
-class ReadAhead:
-    """Has the system read from the disk what is needed next, all at once, where it is there alone.
-
-    Touched one after the other, pages are waited for one by one. To ask for what is in memory costs
-    time, too: so it is asked only for some time after pages had to be waited for.
-    """
-
-    FEW = 8
-    """Pages of a batch that may have to be waited for."""
-    BATCHES = 200
-    """For which it is asked; the next one shows whether that is still wanted."""
-
-    def __init__(self) -> None:
-        self._left = 0
-        self._waited = _pages_waited_for()
-
-    @property
-    def is_wanted(self) -> bool:
-        """Whether to ask before the next batch."""
-        return self._left > 0
-
-    def begin(self) -> None:
-        """A batch is about to be taken."""
-        self._waited = _pages_waited_for()
-
-    def end(self) -> None:
-        """It was taken."""
-        if _pages_waited_for() - self._waited > self.FEW:
-            self._left = self.BATCHES
-        elif self._left:
-            self._left -= 1
-
-    @staticmethod
-    def ask(file: mmap.mmap, begin: NDArray[np.int64], end: NDArray[np.int64]) -> None:
-        """Have these bytes of a file read; returns at once.
-
-        Stretches that end before they begin are passed over.
-        """
-        begin = begin // mmap.PAGESIZE * mmap.PAGESIZE
-        for at, count in zip(begin.tolist(), (end - begin).tolist(), strict=True):
-            if count > 0:
-                file.madvise(mmap.MADV_WILLNEED, at, count)
-
-
-def _pages_waited_for() -> int:
-    """By this thread, ever."""
-    return resource.getrusage(resource.RUSAGE_THREAD).ru_majflt
 
 
 def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:

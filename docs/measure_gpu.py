@@ -16,8 +16,8 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from statistics import median
 from typing import Any, Literal
@@ -25,16 +25,16 @@ from unittest.mock import patch
 
 import torch
 import tyro
+from measure_gains import Change, channels_first
 from rich.console import Console
-from torch import Tensor
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from merl.agents.ddpg import DDPG
 from merl.bench import train, update
 from merl.bench.measuring import circumstances, spread
 from merl.core import MerlError
-from merl.networks import augmentation, encoders
 from merl.networks.critic import TwinCritic
 from merl.replay.on_device import OnDevice
 from merl.training.parts import choose_device
@@ -48,7 +48,7 @@ class Form:
     precision: Literal["bf16", "fp32"] = "bf16"
     compiled: bool = False
     graph: bool = True
-    change: Callable[[], AbstractContextManager[Any]] = nullcontext
+    change: Change = nullcontext
 
 
 def main(
@@ -146,13 +146,15 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
     forms = {
         "as it is": Form(),
         "without a CUDA graph": Form(graph=False),
-        "twin critics one by one": Form(change=lambda: patch.object(TwinCritic, "at_once", False)),
+        "twin critics one by one": Form(
+            change=lambda _: patch.object(TwinCritic, "at_once", False)
+        ),
         "channels first": Form(change=channels_first),
         "compiled": Form(compiled=True),
         "fp32": Form(precision="fp32"),
         "fp32, compiled": Form(precision="fp32", compiled=True),
     }
-    works = {}
+    works: dict[str, tuple[UpdateOnDevice, DDPG]] = {}
     for name, form in forms.items():
         try:
             begun = time.perf_counter()
@@ -162,8 +164,8 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
             print(f"{name}: left out, {type(error).__name__}: {error}", file=sys.stderr)
     rates: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeats):
-        for name, work in works.items():
-            with forms[name].change():
+        for name, (work, learner) in works.items():
+            with forms[name].change(learner):
                 rates[name].append(updates / seconds(work, updates))
     whole = median(rates.get("as it is", [float("nan")]))
     for name, each in rates.items():
@@ -172,28 +174,26 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
     return {"updates_per_s": found, "batch_size": batch_size, "agent": agent} | circumstances()
 
 
-def work_of(agent: str, batch_size: int, form: Form) -> UpdateOnDevice:
-    """An update in that form, recorded and ready."""
+def work_of(agent: str, batch_size: int, form: Form) -> tuple[UpdateOnDevice, DDPG]:
+    """An update in that form, recorded and ready, and who learns by it."""
     device = choose_device("auto")
-    with form.change():
-        learner = update.learner_of(agent, form.precision, device, compiled=form.compiled)
-        if form.change is channels_first:
-            learner.networks.encoders.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-        replay = OnDevice([update.noise_replay()], device)
-        work = UpdateOnDevice(learner, replay, batch_size, seed=0)
-        if not form.graph:
-            work._recorded.WARM_UP = sys.maxsize  # type: ignore[misc]
+    learner = update.learner_of(agent, form.precision, device, compiled=form.compiled)
+    replay = OnDevice([update.noise_replay()], device)
+    work = UpdateOnDevice(learner, replay, batch_size, seed=0)
+    if not form.graph:
+        work._recorded.WARM_UP = sys.maxsize  # type: ignore[misc]
+    with form.change(learner):
         for _ in range(Recorded.WARM_UP + 2):
             work()
         wait()
-    return work
+    return work, learner
 
 
 def kernels(agent: str, batch_size: int, updates: int = 20) -> dict[str, Any]:
     """What an update consists of, longest first; on a GPU kernels, else operations."""
     on_gpu = torch.cuda.is_available()
     # Times inside a graph are not to be trusted everywhere: its kernels, launched one by one.
-    work = work_of(agent, batch_size, Form(graph=False))
+    work, _ = work_of(agent, batch_size, Form(graph=False))
     kind = ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU
     with profile(activities=[kind]) as profiled:
         seconds(work, updates)
@@ -225,18 +225,6 @@ def wait() -> None:
     """For the card."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
-
-
-@contextmanager
-def channels_first() -> Iterator[None]:
-    """Pictures in torch's own order."""
-    as_input = augmentation.to_input
-
-    def contiguous(images: Tensor, dtype: torch.dtype) -> Tensor:
-        return as_input(images, dtype).contiguous()
-
-    with patch.object(encoders, "to_input", contiguous):
-        yield
 
 
 if __name__ == "__main__":

@@ -259,8 +259,10 @@ def test_the_same_generator_and_content_give_the_same_batch():
 
 
 @pytest.mark.parametrize("compress", [False, True])
-def test_what_is_read_ahead_holds_every_picture_of_the_batch(tmp_path, monkeypatch, compress):
-    replay = make(tmp_path / "ring", capacity=30, compress=compress)
+@pytest.mark.parametrize("n_step", [3, 6])
+def test_what_is_read_ahead_holds_the_batch_and_no_more(tmp_path, monkeypatch, compress, n_step):
+    """With n_step 6 the pictures between o_t and o_{t+n} are left out."""
+    replay = make(tmp_path / "ring", capacity=30, compress=compress, n_step=n_step)
     account = Account(replay.config)
     for episode in range(9):  # it wraps
         for t in range(8):
@@ -272,19 +274,21 @@ def test_what_is_read_ahead_holds_every_picture_of_the_batch(tmp_path, monkeypat
     monkeypatch.setattr(ReadAhead, "is_wanted", True)
     replay._sampler.pick = lambda *a, **k: (picks.append(pick(*a, **k)), picks[0])[1]
     replay.sample(1, Every())
-    slots = torch.cat([picks[0].now, picks[0].then], dim=1).numpy()
-    for (key, shape), (begin, end) in zip(IMAGES.items(), asked, strict=True):
+    now, then = picks[0].now, picks[0].then
+    parts = [torch.cat([now, then], dim=1)] if n_step == 3 else [now, then]
+    wanted = [(part.numpy(), *image) for part in parts for image in IMAGES.items()]
+    for (slots, key, shape), (begin, end) in zip(wanted, asked, strict=True):
         name, size = replay.keys[key], math.prod(shape)
         at, count = slots * size, size
         if compress:
             at, count = np.moveaxis(replay._data[f"{name}.span"][slots], -1, 0)
-            at = at % len(replay._pictures[name]._ring)
+            at = at % len(replay._compressed[name]._ring)
         in_one_piece = end > begin
         assert in_one_piece.mean() > 0.5
-        assert compress or not in_one_piece.all()
+        assert compress or n_step == 6 or not in_one_piece.all()
         assert (begin[:, None] <= at)[in_one_piece].all()
         assert (at + count <= end[:, None])[in_one_piece].all()
-        assert (end - begin)[in_one_piece].max() < 8 * (size + 64)
+        assert (end - begin)[in_one_piece].max() <= slots.shape[1] * (size + 64 * compress)
 
 
 def test_it_is_asked_for_some_time_after_pages_were_waited_for(monkeypatch):

@@ -30,7 +30,8 @@ class TwinCritic(nn.Module):
     def forward(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Latent (B, d) and action (B, A) to the two values, (B,) each."""
         both = torch.cat([latent, action], dim=-1)
-        if both.is_cuda if self.at_once is None else self.at_once:
+        at_once = both.is_cuda if self.at_once is None else self.at_once
+        if at_once:
             q1, q2 = twins(self.q1, self.q2, both)
         else:
             q1, q2 = self.q1(both), self.q2(both)

@@ -73,17 +73,7 @@ class Lanes:
     ) -> Batch:
         """Draw steps uniformly, with replacement; those of one lane lie side by side.
 
-        Args:
-            batch_size: B.
-            rng: draws.
-            now: how the frames of o_t are copied out, where not as they are.
-            then: likewise of o_{t+n}.
-
-        Returns:
-            Tensors on the CPU that are the caller's own; shapes as in `merl.core.Batch`.
-
-        Raises:
-            ValueError: no step is held yet.
+        Arguments, batch and errors are those of `Replay.sample`.
         """
         if len(self.lanes) == 1 or not len(self):
             return self.lanes[0].sample(batch_size, rng, now, then)

@@ -104,7 +104,7 @@ class Replay:
                 for name, field in fields.items()
             }
         self.keys = {key: field_name(key) for key in observation_space.spaces}
-        self._pictures = {
+        self._compressed = {
             name: CompressedPictures(
                 arrays.pop(name).reshape(-1),
                 arrays[span_name(key)],
@@ -118,13 +118,13 @@ class Replay:
         self._values = {**fields_of(observation_space, action_space)}  # what is written
         self._ahead = ReadAhead()
         self._images: dict[str, Pictures] = {
-            name: self._pictures[name] if name in self._pictures else RawPictures(arrays[name])
+            name: self._compressed[name] if name in self._compressed else RawPictures(arrays[name])
             for key, name in self.keys.items()
             if is_image(observation_space[key])
         }
         self._journal: Journal | None = None
         if directory is not None:
-            self._journal = Journal(directory, self._data, self._pictures)
+            self._journal = Journal(directory, self._data, self._compressed)
         self.slots = len(self._data["moment"])
         fields_there = {name: torch.from_numpy(array) for name, array in arrays.items()}
         self._sampler = Sampler(fields_there, self.slots, config)
@@ -148,7 +148,7 @@ class Replay:
             MerlError: the observation does not fit the space.
         """
         self._write(observation, position=0, action=None, reward=0.0, discount=1.0)
-        for name, pictures in self._pictures.items():
+        for name, pictures in self._compressed.items():
             pictures.begun(next(observation[key] for key, n in self.keys.items() if n == name))
         self._open = True
 
@@ -226,7 +226,7 @@ class Replay:
     @property
     def compressed(self) -> bool:
         """Whether pictures are kept compressed."""
-        return bool(self._pictures)
+        return bool(self._compressed)
 
     def arrays(self) -> Mapping[str, NDArray[Any]]:
         """The ring's arrays by field, (slots, ...), to be read; of compressed pictures none."""
@@ -295,12 +295,12 @@ class Replay:
             check_value(name, value, field.dtype, field.shape)
         moment = self._moments + 1
         slot = self._slot(moment)
-        kept = {n: p.encode(np.asarray(values.pop(n))) for n, p in self._pictures.items()}
+        kept = {n: p.encode(np.asarray(values.pop(n))) for n, p in self._compressed.items()}
         self._make_room(moment, kept)
         for name, value in values.items():
             data[name][slot] = value
         for name, picture in kept.items():
-            self._pictures[name].write(slot, picture)
+            self._compressed[name].write(slot, picture)
         data["position"][slot] = position
         data["reward"][slot] = reward
         data["discount"][slot] = discount
@@ -310,11 +310,11 @@ class Replay:
 
     def _make_room(self, moment: int, kept: Mapping[str, bytes]) -> None:
         """Let go of the oldest moments, as many as moment number `moment` will overwrite."""
-        ends = {name: self._pictures[name].end_of(picture) for name, picture in kept.items()}
+        ends = {name: self._compressed[name].end_of(picture) for name, picture in kept.items()}
         while self._oldest < moment:
             slot = self._slot(self._oldest)
             if self._oldest > moment - self.slots:
-                if not any(self._pictures[n].overwritten(slot, end) for n, end in ends.items()):
+                if not any(self._compressed[n].overwritten(slot, end) for n, end in ends.items()):
                     break
                 self._tell_of_less()
             if self._journal is not None and self._oldest <= self._settled:
@@ -358,7 +358,7 @@ class Replay:
         slots = (numbers - 1) % self.slots
         missing = numbers[stamps[slots] != numbers]  # overwritten since, or only half written
         self._oldest = int(missing[-1] if missing.size else moments - len(numbers)) + 1
-        for pictures in self._pictures.values():
+        for pictures in self._compressed.values():
             pictures.go_on_after(self._slot(moments) if moments else None)
         leads = (numbers[:-1] >= self._oldest) & (self._data["position"][slots[1:]] > 0)
         sources = numbers[:-1][leads][-self.capacity :]
@@ -385,7 +385,7 @@ class Replay:
             key: torch.from_numpy(
                 copied(self._images[name], slots.numpy(), copies.get(key, as_it_is))
             )
-            if name in self._pictures or key in copies
+            if name in self._compressed or key in copies
             else self._sampler.observed(name, slots)
             for key, name in self.keys.items()
         }

@@ -120,8 +120,8 @@ def choose_device(name: str) -> torch.device:
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and not torch.cuda.is_available():
         raise MerlError("--device cuda: no CUDA device is found here; use --device cpu or auto")
-    # A run's shapes never change: trying every way to convolve once pays.
-    torch.backends.cudnn.benchmark = True
+    if name == "cuda":  # a run's shapes never change: trying every way to convolve once pays
+        torch.backends.cudnn.benchmark = True
     return torch.device(name)
 
 

@@ -276,6 +276,8 @@ BAD = {
     "train reach_duplo --threads 1000000": "but this machine has",
     "train reach_duplo --render-size 100000": "render_size is 100000: ",
     f"train reach_duplo --run-dir {'a' * 300}": "cannot be used: File name too long",
+    "train reach_duplo --agent ddpg --agent.fusion shared": "agent.latent-dim 0 there is none",
+    "train reach_duplo --agent.latent-dim 0 --agent.no-fusion-norm": "fusion-norm False is of a",
     "train reach_duplo --agent.tau 0": "(0, 1], not 0.0",
     "train reach_duplo --agent.tau 1.01": "(0, 1], not 1.01",
     "train reach_duplo --agent.tau nan": "(0, 1], not nan",

@@ -105,6 +105,12 @@ class AgentConfig:
                     f"agent.{_flag(name)} must be at least {bound} and at most {most}, "
                     f"not {getattr(self, name)}"
                 )
+        for name in ("fusion", "fusion_norm", "squash"):
+            if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):
+                raise MerlError(
+                    f"agent.{_flag(name)} {getattr(self, name)} is of a fusion, and with "
+                    "agent.latent-dim 0 there is none: leave it out, or give a latent-dim"
+                )
         if not self.conv_strides or min(self.conv_strides) < 1:
             raise MerlError(
                 f"agent.conv-strides {self.conv_strides} must name a stride of at least 1 for each "

@@ -210,14 +210,14 @@ def test_as_a_gpu_computes_the_twins(case: Case, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("at_once", [False, True])
 def test_compiled(at_once: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes a minute, and a C++ compiler."""
-    case = replace(CASES[0], config=replace(SMALL, compile=True))
+    case = replace(CASES[0], config=replace(SMALL, torch_compile="yes"))
     monkeypatch.setattr(TwinCritic, "at_once", at_once)
     check_in_double_precision(case, updates=5)
     assert case.agent().networks.critic._compiled_call_impl is not None
     # In bf16 it rounds elsewhere, but where eager mode computes in single precision, so does it.
     gradients = []
-    for compiled in (False, True):
-        config = replace(SMALL, compile=compiled, precision="bf16")
+    for compiled in ("no", "yes"):
+        config = replace(SMALL, torch_compile=compiled, precision="bf16")
         agent = prepared(replace(case, config=config, batch=64), torch.float32)
         learn(agent, replace(case, config=config, batch=64), 0, torch.float32)
         gradients.append(gradients_of(agent))

@@ -146,6 +146,11 @@ def test_it_runs_and_shows_every_side(monkeypatch: pytest.MonkeyPatch) -> None:
     for side in (bench.REFERENCE, f"{bench.OURS}, bf16", bench.DRQV2, f"{bench.OUR_DRQV2}, fp32"):
         assert result["updates_per_s"][side]["median"] > 0
         assert side in shown
+    assert "two cores" in shown
+    result["machine"]["gpu"] = "a card"  # which has bars of its own
+    with console.capture() as capture:
+        console.print(bench.table(result))
+    assert "two cores" not in capture.get()
     assert set(result["ratio"]) == {
         f"{side}, {precision}"
         for side in (bench.OURS, bench.OUR_DRQV2)

@@ -5,10 +5,13 @@ import dataclasses
 import pytest
 import torch
 
+from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
+from merl.core import MerlError
 from merl.replay import ReplayConfig
+from merl.training import timing
 from merl.training.config import EvaluationConfig, TrainConfig
-from merl.training.timing import Arithmetic, Timing, measure
+from merl.training.timing import WORTH_COMPILING, Arithmetic, Timing, measure, worth_compiling
 from toy import DotEnv
 
 FP32, BF16, BF16_ALL = Arithmetic("fp32", 1), Arithmetic("bf16", 1), Arithmetic("bf16", 4)
@@ -67,3 +70,53 @@ def test_only_what_is_left_open_is_timed(precision, threads, tried) -> None:  # 
     assert set(timing.update) == tried
     assert all(seconds > 0 for seconds in timing.update.values())
     assert timing.step > 0
+
+
+def with_compile(torch_compile: str) -> TrainConfig:
+    agent = dataclasses.replace(CONFIG.agent, precision="fp32", torch_compile=torch_compile)
+    return dataclasses.replace(CONFIG, agent=agent, threads=1)
+
+
+@pytest.mark.parametrize(
+    ("asked", "device", "seconds", "tried"),
+    [
+        ("auto", "cuda", 1.1 * WORTH_COMPILING, True),
+        ("auto", "cuda", 0.9 * WORTH_COMPILING, False),
+        ("auto", "cpu", 1.1 * WORTH_COMPILING, False),
+        ("no", "cuda", 1.1 * WORTH_COMPILING, False),
+        ("yes", "cuda", 1.1 * WORTH_COMPILING, False),  # that is what was timed already
+    ],
+)
+def test_compiling_is_tried_on_a_gpu_for_a_long_run(asked, device, seconds, tried) -> None:  # type: ignore[no-untyped-def]
+    slow = Timing({FP32: 0.0}, seconds / (CONFIG.steps + 10 * 250))
+    assert worth_compiling(with_compile(asked), slow, torch.device(device)) == tried
+
+
+def test_where_compiling_fails_it_is_left_out_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: DDPG) -> None:
+        raise RuntimeError("no compiler\n  at all")
+
+    monkeypatch.setattr(DDPG, "_compile", fail)
+    monkeypatch.setattr(timing, "worth_compiling", lambda *_: True)
+    env = DotEnv()
+    env.length = 10_000
+    cpu = torch.device("cpu")
+    found = measure(with_compile("auto"), env, DotEnv(), env.observation_space, cpu)
+    assert set(found.update) == {FP32}
+    assert found.not_compiled == "no compiler"
+    assert found.best.decided(CONFIG.agent).torch_compile == "no"
+    with pytest.raises(MerlError, match=r"yes: the compiled update fails here \(no compiler\)"):
+        measure(with_compile("yes"), env, DotEnv(), env.observation_space, cpu)
+
+
+@pytest.mark.long
+def test_where_compiling_works_it_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes a minute, and a C++ compiler."""
+    monkeypatch.setattr(timing, "worth_compiling", lambda *_: True)
+    env = DotEnv()
+    env.length = 10_000
+    found = measure(with_compile("auto"), env, DotEnv(), env.observation_space, torch.device("cpu"))
+    compiled = dataclasses.replace(FP32, compiled=True)
+    assert set(found.update) == {FP32, compiled}
+    assert found.not_compiled is None
+    assert compiled.decided(CONFIG.agent).torch_compile == "yes"

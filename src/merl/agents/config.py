@@ -12,6 +12,7 @@ from merl.networks.fusion import Squash
 Precision = Literal["auto", "fp32", "bf16"]
 Target = Literal["heads", "heads_and_fusion"]
 FusionOwner = Literal["decoupled", "shared", "shared_by_both"]
+TorchCompile = Literal["auto", "yes", "no"]
 
 WIDEST = 65_536
 """More than any layer here has ever been given."""
@@ -72,9 +73,9 @@ class AgentConfig:
     precision: Precision = "auto"
     """Arithmetic of the update: fp32, bf16 (weights, norms, targets and losses stay fp32), or auto,
     which times both once."""
-    compile: bool = False
-    """Have torch compile what updates compute: a minute before the first one, and a C++ compiler or
-    Triton; to be tried on a GPU (docs/bench.md)."""
+    torch_compile: TorchCompile = "auto"
+    """Whether torch compiles what updates compute, which takes a minute or two: yes, no, or auto,
+    which tries it once on a GPU, for a run that takes long, and keeps it where it is faster."""
 
     def __post_init__(self) -> None:
         if not 0 < self.learning_rate < math.inf:
@@ -84,6 +85,7 @@ class AgentConfig:
             ("target", self.target, get_args(Target)),
             ("squash", self.squash, get_args(Squash)),
             ("fusion", self.fusion, get_args(FusionOwner)),
+            ("torch-compile", self.torch_compile, get_args(TorchCompile)),
         ):
             check_choice(f"agent.{name}", value, choices)
         if not 0 < self.tau <= 1:

@@ -61,7 +61,7 @@ class DDPG:
 
     Args:
         networks: freshly initialised; moved to `device`.
-        config: how to learn; `precision` "auto" counts as fp32 here.
+        config: how to learn; `precision` "auto" counts as fp32 here, `torch_compile` "auto" as no.
         seed: of the noise and the shifts.
         device: where everything lives.
 
@@ -89,7 +89,7 @@ class DDPG:
         self.actor_parameters = [*self._actors_fusion(), *networks.actor.parameters()]
         self.critic_optimizer = self._adam(self.critic_parameters)
         self.actor_optimizer = self._adam(self.actor_parameters)
-        if config.compile:
+        if config.torch_compile == "yes":
             self._compile()
         words = np.random.SeedSequence(seed).generate_state(2)
         self.acting, self.learning = (
@@ -265,8 +265,8 @@ class DDPG:
         networks = self.networks
         sensed = {key: observation[key] for key in networks.senses}
         # As it is written: batches of acting come in sizes that would each have to be compiled.
-        eager = torch.compiler.set_stance("force_eager") if self.config.compile else nullcontext()
-        with eager:
+        compiled = self.config.torch_compile == "yes"
+        with torch.compiler.set_stance("force_eager") if compiled else nullcontext():
             return networks.actor(networks.actor_latent(networks.encoders(sensed)))
 
     def _actors_fusion(self) -> Iterator[nn.Parameter]:

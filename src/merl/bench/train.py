@@ -64,6 +64,7 @@ def run(
     rates, config = steps_per_second(_sides(), task, preset, repeats, steps)
     result |= {
         "precision": config.agent.precision,
+        "compiled": config.agent.torch_compile == "yes",
         "threads": config.threads,
         "updates_per_step": config.updates_per_step,
     }
@@ -93,7 +94,7 @@ def steps_per_second(
         stack.callback(env.close)
         space, _ = run_spaces(config, env)
         best = measure(config, env, env, space, choose_device(config.device)).best
-        agent = dataclasses.replace(config.agent, precision=best.precision)
+        agent = best.decided(config.agent)
         config = dataclasses.replace(config, agent=agent, threads=best.threads)
         use_threads(best.threads)
         keep_freed_memory()

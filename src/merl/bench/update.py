@@ -25,6 +25,7 @@ from merl.core import Batch, MerlError, Transition
 from merl.replay import Replay, ReplayConfig
 from merl.replay.on_device import OnDevice
 from merl.training.parts import choose_device
+from merl.training.timing import Arithmetic
 from merl.training.updating import Recorded, UpdateOnDevice
 
 SIDE, STACK, PROPRIO, ACTIONS, LAYERS = 84, 3, 24, 9, 6
@@ -41,7 +42,9 @@ SB3_DIFFERS = (
 )
 BARS = {f"{OURS}, bf16": 6.0, f"{OURS}, fp32": 1.5}
 """How many times as fast as the reference it is to be, on two cores with AMX-bf16."""
-WHOLE = ", drawn on the card"
+WHOLE, COMPILED = ", drawn on the card", ", compiled"
+BARS_ON_GPU = {f"{OURS}, bf16{WHOLE}": 4.0, f"{OURS}, bf16{WHOLE}{COMPILED}": 4.0}
+"""Likewise, whichever of the two training takes."""
 UPDATES_ON_GPU = 50
 """In a turn."""
 
@@ -54,12 +57,13 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
         batch_size: B.
 
     On a GPU each turn is `UPDATES_ON_GPU` updates, and beside the update from a batch that lies on
-    the card there is the whole of it, drawn from a replay that lies there, as training makes it.
+    the card there is the whole of it, drawn from a replay that lies there, as training makes it; in
+    bf16 by torch.compile, too, where that runs.
 
     Returns:
         Plain values: `updates_per_s` by side and `ratio` (to the reference of the same agent,
-        within each round), each as `median`, `low` and `high` over the rounds; `skipped`, why a
-        side is missing; the circumstances.
+        within each round), each as `median`, `low` and `high` over the rounds; `skipped` and
+        `not_compiled`, why a side is missing; the circumstances.
     """
     device = choose_device("auto")
     on_gpu = device.type == "cuda"
@@ -87,14 +91,21 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
             name, learner = f"{ours}, {precision}", learner_of(agent, precision, device)
             sides[name] = repeated(partial(learner.update, batch))
             of[name] = reference
-            if replay is not None:
-                name += WHOLE
-                update = UpdateOnDevice(
-                    learner_of(agent, precision, device), replay, batch_size, seed=0
-                )
-                for _ in range(Recorded.WARM_UP):
-                    update()
-                sides[name], of[name] = repeated(update), reference
+            if replay is None:
+                continue
+            for compiled in (False, True) if precision == "bf16" else (False,):
+                whole = f"{name}{WHOLE}{COMPILED if compiled else ''}"
+                learner = learner_of(agent, precision, device, compiled=compiled)
+                update = UpdateOnDevice(learner, replay, batch_size, seed=0)
+                try:
+                    for _ in range(Recorded.WARM_UP + 1):
+                        update()
+                except Exception as error:
+                    if not compiled:
+                        raise
+                    result["not_compiled"] = f"{whole}: {type(error).__name__}"
+                    continue
+                sides[whole], of[whole] = repeated(update), reference
     try:
         sides[SB3] = repeated(_stable_baselines(batch_size, device))
         of[SB3], result["stable_baselines"] = REFERENCE, SB3_DIFFERS
@@ -117,13 +128,13 @@ def table(result: dict[str, Any]) -> Table:
     rows = Table(title=f"{title} (least to most), {result['threads']} threads")
     for heading in ("", "updates/s", "times the reference", "bar"):
         rows.add_column(heading, justify="right" if heading else "left")
+    bars = BARS_ON_GPU if result["machine"]["gpu"] else BARS
     for side, rate in result["updates_per_s"].items():
         ratio = result["ratio"].get(side)
-        bar = BARS.get(side)
+        bar = bars.get(side)
         rows.add_row(side, shown(rate), shown(ratio) if ratio else "", f"{bar:g}" if bar else "")
-    notes = ["the bars are for two cores with AMX-bf16"]
-    if "skipped" in result:
-        notes.append(f"left out: {result['skipped']}")
+    notes = [] if result["machine"]["gpu"] else ["the bars are for two cores with AMX-bf16"]
+    notes += [f"left out: {result[why]}" for why in ("skipped", "not_compiled") if why in result]
     if "stable_baselines" in result:
         notes.append(f"{SB3} is {result['stable_baselines']}")
     rows.caption = "; ".join(notes)
@@ -174,7 +185,7 @@ def learner_of(
     compiled: bool = False,
 ) -> DDPG:
     """Ours, in the size that is timed, for pictures of `side` pixels squared."""
-    config = dataclasses.replace(AGENTS[agent], precision=precision, compile=compiled)
+    config = Arithmetic(precision, torch.get_num_threads(), compiled).decided(AGENTS[agent])
     if agent == "merl":
         config = dataclasses.replace(config, head_layers=LAYERS)
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)

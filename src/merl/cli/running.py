@@ -47,7 +47,7 @@ def go_on(run: Run, asked: TrainConfig) -> int:
     config, changes = taken_up(run.config, asked)
     if run.has_moved() or config.device != run.config.device:
         # What was decided for another machine or device is open again.
-        agent = dataclasses.replace(config.agent, precision="auto")
+        agent = dataclasses.replace(config.agent, precision="auto", torch_compile="auto")
         config = dataclasses.replace(config, threads=None, agent=agent)
     with run.lock():
         if run.begin_again():
@@ -112,7 +112,7 @@ def _outlook(parts: Parts, what: str, done: int) -> str:
     config, timing = parts.config, parts.timing
     seconds = timing.seconds(config, done)
     size = replay_bytes(config.replay, parts.space, parts.action_space, config.capacity)
-    tried = ", ".join(f"{1000 * s:.0f} ms in {how}" for how, s in timing.update.items())
+    tried = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
     seen = not config.own_env and any(is_image(space) for space in parts.space.values())
     pictures = f" ({config.env.renderer} pictures)" if seen else ""
     lines = [
@@ -125,6 +125,8 @@ def _outlook(parts: Parts, what: str, done: int) -> str:
         f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms a step{pictures}",
         f"the replay takes {decimal(size)} for {config.capacity:,} steps",
     ]
+    if timing.not_compiled is not None:
+        lines.append(f"updates are not compiled, which fails here: {timing.not_compiled}")
     if (config.steps - config.seed_steps) * config.updates_per_step < 1:
         lines.append(
             f"nothing will be learnt: the first update comes after {config.seed_steps:,} steps, "

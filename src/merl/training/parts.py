@@ -31,7 +31,7 @@ class Parts:
     """Environments, agent, and where the run stands.
 
     Attributes:
-        config: with `device`, `threads` and the agent's `precision` decided.
+        config: with `device`, `threads`, the agent's `precision` and `torch_compile` decided.
         timing: what this machine needs for a step and an update.
         env: to act in.
         eval_env: to be evaluated in.
@@ -59,7 +59,7 @@ class Parts:
             config,
             threads=best.threads,
             device="cuda" if self.device.type == "cuda" else "cpu",
-            agent=dataclasses.replace(config.agent, precision=best.precision),
+            agent=best.decided(config.agent),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
         self.agent: DDPG = make_agent(

@@ -24,9 +24,16 @@ HARMLESS = (
     "eval.video",
     "eval.references",
     "agent.precision",
+    "agent.torch_compile",
 )
 """Fields that may change: they decide how long, how fast and how closely watched, not what."""
-_LEFT_OPEN = {"device": "auto", "threads": None, "agent.precision": "auto", "minutes": None}
+_LEFT_OPEN = {
+    "device": "auto",
+    "threads": None,
+    "agent.precision": "auto",
+    "agent.torch_compile": "auto",
+    "minutes": None,
+}
 """Values that ask for nothing: what the run has decided stays."""
 _NAMES = ("run_dir", "preset", "setting")
 """Fields that only say where the others are from."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import torch
 from gymnasium import spaces
 
 from merl.agents import make_agent
+from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.core import Batch, MerlError, is_image
 from merl.resources import allow_picture_threads
@@ -24,10 +26,14 @@ from merl.training.loop import Update
 from merl.training.updating import Recorded
 
 REPEATS = 3
+REPEATS_ON_GPU = 30
+"""Of an update there, which takes a few milliseconds."""
 MEASURED_STEPS = 25
 THREADS_PAY = 1.3
 """How many times faster several threads must be than one to be chosen. They wait for each other at
 every operation: once another process takes a core, they can become ten times slower than one."""
+WORTH_COMPILING = 1800.0
+"""Seconds that a run must take for a compiled update to be tried, which takes a minute or two."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +42,16 @@ class Arithmetic:
 
     precision: Literal["fp32", "bf16"]
     threads: int
+    compiled: bool = False
 
     def __str__(self) -> str:
-        return f"{self.precision} on {self.threads} thread{'s' * (self.threads > 1)}"
+        how = f"{self.precision}, compiled," if self.compiled else self.precision
+        return f"{how} on {self.threads} thread{'s' * (self.threads > 1)}"
+
+    def decided(self, config: AgentConfig) -> AgentConfig:
+        """A config with what it may have left open."""
+        torch_compile: Literal["yes", "no"] = "yes" if self.compiled else "no"
+        return dataclasses.replace(config, precision=self.precision, torch_compile=torch_compile)
 
 
 @dataclass(frozen=True)
@@ -50,11 +63,13 @@ class Timing:
         step: of acting and one step of the run's environment, picture included; where actions are
             held, that is one decision.
         frame: of one picture of a video; 0 where none is made.
+        not_compiled: why updates cannot be compiled, where that was tried.
     """
 
     update: Mapping[Arithmetic, float]
     step: float
     frame: float = 0.0
+    not_compiled: str | None = None
 
     @property
     def best(self) -> Arithmetic:
@@ -87,7 +102,10 @@ def measure(
 ) -> Timing:
     """Time the environment's step, and the update in every way that the config leaves open.
 
-    Precision first, on one thread; then the fastest on all threads.
+    Precision first, on one thread; then the fastest on all threads, or on a GPU compiled.
+
+    Raises:
+        MerlError: the update is to be compiled, and cannot be.
     """
     asked, cores = config.agent.precision, len(os.sched_getaffinity(0))
     threads = config.threads or (cores if device.type == "cuda" else 1)
@@ -100,19 +118,42 @@ def measure(
 
     def attempt(arithmetic: Arithmetic) -> DDPG:
         use_threads(arithmetic.threads)
-        agent = _agent(config, space, batch, device, arithmetic.precision)
-        update[arithmetic] = _time_update(agent, batch)
+        try:
+            agent = _agent(config, space, batch, device, arithmetic)
+            update[arithmetic] = _time_update(agent, batch)
+        except Exception as error:
+            if arithmetic.compiled:
+                raise _CompileError(error) from error
+            raise
         return agent
 
+    compiled = config.agent.torch_compile == "yes"
     for precision in precisions:
-        agent = attempt(Arithmetic(precision, threads))
+        agent = attempt(Arithmetic(precision, threads, compiled))
     fastest = min(update, key=lambda arithmetic: update[arithmetic])
     if config.threads is None and cores > threads:
-        attempt(Arithmetic(fastest.precision, cores))
+        attempt(dataclasses.replace(fastest, threads=cores))
     use_threads(threads)
     films = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
     frame = _time_frame(eval_env) if films else 0.0
-    return Timing(update, _time_step(env) + _time_acting(agent, batch), frame)
+    timing = Timing(update, _time_step(env) + _time_acting(agent, batch), frame)
+    if not worth_compiling(config, timing, device):
+        return timing
+    print("merl: trying torch.compile, once, for a minute or two", file=sys.stderr)
+    try:
+        attempt(dataclasses.replace(fastest, compiled=True))
+    except _CompileError as failure:
+        return dataclasses.replace(timing, not_compiled=failure.reason)
+    return timing
+
+
+def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -> bool:
+    """Whether a compiled update is to be tried: on a GPU, for a long run, where that is left open.
+
+    On a CPU it was never faster (docs/bench.md).
+    """
+    left_open = config.agent.torch_compile == "auto"
+    return left_open and device.type == "cuda" and timing.seconds(config) > WORTH_COMPILING
 
 
 def use_threads(count: int) -> None:
@@ -150,10 +191,10 @@ def _agent(
     space: spaces.Dict,
     batch: Batch,
     device: torch.device,
-    precision: Literal["fp32", "bf16"],
+    arithmetic: Arithmetic,
 ) -> DDPG:
     return make_agent(
-        dataclasses.replace(config.agent, precision=precision),
+        arithmetic.decided(config.agent),
         space,
         spaces.Box(-1.0, 1.0, batch.action.shape[1:]),
         frame_stack=config.replay.frame_stack,
@@ -164,25 +205,27 @@ def _agent(
 
 def _time_update(agent: DDPG, batch: Batch) -> float:
     make: Update = partial(agent.update, batch)
-    first = 1  # the first one sets up what the others use
+    first, repeats = 1, REPEATS  # the first one sets up what the others use
     if agent.device.type == "cuda":  # where training records it
         there = batch.to(agent.device)
-        make, first = Recorded(agent, lambda: there), Recorded.WARM_UP + 1
+        make, first, repeats = Recorded(agent, lambda: there), Recorded.WARM_UP + 1, REPEATS_ON_GPU
 
     def update() -> None:
         float(make()["critic_loss"])  # reading it waits for the device
 
-    try:
-        for _ in range(first):
-            update()
-    except Exception as error:
-        if not agent.config.compile:
-            raise
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise MerlError(
-            f"--agent.compile: the compiled update fails here ({reason}): leave it out"
-        ) from error
-    return _median_seconds(update)
+    for _ in range(first):
+        update()
+    return _median_seconds(update, repeats)
+
+
+class _CompileError(MerlError):
+    """What torch makes of an update does not run here."""
+
+    def __init__(self, error: Exception) -> None:
+        self.reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        super().__init__(
+            f"agent.torch-compile yes: the compiled update fails here ({self.reason}): leave it out"
+        )
 
 
 def _time_acting(agent: DDPG, batch: Batch) -> float:
@@ -214,9 +257,9 @@ def _time_frame(env: gymnasium.Env[Any, Any]) -> float:
     return _median_seconds(env.render)
 
 
-def _median_seconds(work: Callable[[], object]) -> float:
+def _median_seconds(work: Callable[[], object], repeats: int = REPEATS) -> float:
     seconds = []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         start = time.perf_counter()
         work()
         seconds.append(time.perf_counter() - start)

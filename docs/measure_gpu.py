@@ -81,7 +81,7 @@ def main(
     for name, part in {
         "launches": lambda: launches(agent),
         "gains": lambda: gains(agent, batch_size, updates, repeats),
-        "profile": lambda: kernels(agent, batch_size),
+        "profile": lambda: profiles(agent, batch_size),
         "update": lambda: shown(update, repeats=repeats, batch_size=batch_size),
         "train": lambda: loop(min(repeats, 3)),
     }.items():
@@ -189,11 +189,19 @@ def work_of(agent: str, batch_size: int, form: Form) -> tuple[UpdateOnDevice, DD
     return work, learner
 
 
-def kernels(agent: str, batch_size: int, updates: int = 20) -> dict[str, Any]:
-    """What an update consists of, longest first; on a GPU kernels, else operations."""
+def profiles(agent: str, batch_size: int) -> dict[str, Any]:
+    """What an update consists of, and compiled on a GPU."""
+    found = {"not compiled": kernels(agent, batch_size, compiled=False)}
+    if torch.cuda.is_available():
+        found["compiled"] = kernels(agent, batch_size, compiled=True)
+    return found | circumstances()
+
+
+def kernels(agent: str, batch_size: int, *, compiled: bool, updates: int = 20) -> dict[str, Any]:
+    """What it consists of, longest first; on a GPU kernels, else operations."""
     on_gpu = torch.cuda.is_available()
     # Times inside a graph are not to be trusted everywhere: its kernels, launched one by one.
-    work, _ = work_of(agent, batch_size, Form(graph=False))
+    work, _ = work_of(agent, batch_size, Form(graph=False, compiled=compiled))
     kind = ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU
     with profile(activities=[kind]) as profiled:
         seconds(work, updates)
@@ -205,10 +213,11 @@ def kernels(agent: str, batch_size: int, updates: int = 20) -> dict[str, Any]:
         rows.append((own / updates, event.count / updates, event.key))
     rows.sort(reverse=True)
     count, total = sum(row[1] for row in rows), sum(row[0] for row in rows)
-    print(f"{count:.0f} kernels, {total:,.0f} us an update")
+    form = "compiled" if compiled else "not compiled"
+    print(f"{form}: {count:.0f} kernels, {total:,.0f} us an update")
     for microseconds, often, name in rows[:25]:
         print(f"{microseconds:10,.1f} us {often:6.1f} x  {name[:100]}")
-    return {"microseconds": total, "kernels": count, "longest": rows[:60]} | circumstances()
+    return {"microseconds": total, "kernels": count, "longest": rows[:60]}
 
 
 def seconds(work: Callable[[], object], times: int) -> float:

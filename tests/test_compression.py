@@ -13,6 +13,7 @@ import merl
 from merl.core import Batch, Transition
 from merl.replay import Replay, ReplayConfig, replay_bytes
 from merl.replay.compression import STAGES, CompressedPictures
+from merl.replay.places import Places
 
 SIDE = 16
 NOISE = spaces.Dict({"image": spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)})
@@ -159,14 +160,20 @@ def test_a_picture_half_written_is_none(tmp_path: Path, monkeypatch: pytest.Monk
     assert_right(everything(replay), 143)
 
 
-def test_it_does_not_grow_once_its_bytes_have_wrapped(tmp_path: Path) -> None:
+@pytest.mark.parametrize("capacity", [62, 90, 300])
+@pytest.mark.parametrize("played", [35, 49, 63, 77, 140])
+def test_it_grows_where_its_bytes_have_wrapped(tmp_path: Path, capacity: int, played: int) -> None:
     replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
-    play(replay, 0, 35)
+    play(replay, 0, played)
     before = everything(replay)
-    again = Replay(config(capacity=90), NOISE, ACTIONS, directory=tmp_path)
+    again = Replay(config(capacity=capacity), NOISE, ACTIONS, directory=tmp_path)
     assert_same(everything(again), before)
-    play(again, 35, 70)
-    assert_right(everything(again), 104)
+    for begin in range(played, played + 280, 35):
+        play(again, begin, 35)
+        assert_right(everything(again), begin + 34)
+        again = Replay(config(capacity=capacity), NOISE, ACTIONS, directory=tmp_path)
+        assert_right(everything(again), begin + 34)
+    assert len(again) > len(before.action) * min(capacity / 70, 1.2)
 
 
 def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> None:
@@ -174,7 +181,11 @@ def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> 
     still = rng.integers(0, 256, (8, 8, 3)).astype(np.uint8)
     file = tmp_path / "background"
     pictures = CompressedPictures(
-        np.zeros(100_000, np.uint8), np.zeros((100, 2), np.int64), (8, 8, 3), file
+        np.zeros(100_000, np.uint8),
+        Places(100_000),
+        np.zeros((100, 2), np.int64),
+        (8, 8, 3),
+        file,
     )
     sizes = []
     for number in range(STAGES[-1] + 1):

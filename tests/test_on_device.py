@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,6 +125,20 @@ def test_a_draw_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         assert value.shape == expected[name].shape
 
 
-def test_rings_of_several_sizes_are_refused() -> None:
-    with pytest.raises(ValueError, match="same"):
-        OnDevice([make(capacity=20), make(capacity=30)], torch.device("cpu"))
+def test_rings_that_have_grown_by_different_amounts(tmp_path: Path) -> None:
+    """One has come round, the other not; both are opened with a larger capacity."""
+    rings, plans = [], [[Episode(6, "end")] * 5, [Episode(8, "limit")]]
+    for number, plan in enumerate(plans):
+        ring = make(tmp_path / str(number))
+        for _ in writing(ring, number, plan):
+            pass
+        rings.append(make(tmp_path / str(number), capacity=30))
+    lengths = [ring.places.length for ring in rings]
+    assert len(set(lengths)) == 2
+    copy = OnDevice(rings, torch.device("cpu"))
+    for episode in range(6):
+        copy.follow()
+        check(copy, rings)
+        for number, ring in enumerate(rings):
+            for _ in writing(ring, 10 + 2 * episode + number, [Episode(7, "limit")]):
+                pass

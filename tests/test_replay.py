@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.replay import Lanes, Replay, ReplayConfig, check_fits, pictures, replay_bytes
+from merl.replay import Lanes, Replay, ReplayConfig, check_fits, pictures, replay_bytes, storage
 from merl.replay.pictures import ReadAhead
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
@@ -83,10 +83,14 @@ class Account:
     moments: list[tuple[int, int]] = field(default_factory=list)  # (episode, t), all ever written
     ended: set[int] = field(default_factory=set)  # episodes that truly ended
     lost: int = 0  # so many of the oldest moments are overwritten
+    length: int = 0  # slots, if they are more than the capacity asks for
 
     @property
     def slots(self) -> int:
-        return self.config.capacity + self.config.capacity // 200 + self.config.frame_stack
+        return (
+            self.length
+            or self.config.capacity + self.config.capacity // 200 + self.config.frame_stack
+        )
 
     def see(self, episode: int, t: int) -> None:
         self.moments.append((episode, t))
@@ -605,14 +609,76 @@ def test_it_grows_when_opened_with_a_larger_capacity(tmp_path):
     check(run.replay, run.account)
 
 
-def test_a_ring_that_has_wrapped_stays_as_long_as_it_is(tmp_path):
-    run = Run(tmp_path / "replay")
-    run.play(9, 9, 9, 9, 9)
-    held = len(run.replay)
-    run.replay = make(run.directory, capacity=60)
-    assert len(run.replay) == held
+def lengthen(run: Run, capacity: int) -> None:
+    """Open it again, with a larger capacity."""
+    before, held = run.replay.places.length, run.account.held()
+    run.values["capacity"] = capacity
+    run.account.config = config(**run.values)
+    run.replay = make(run.directory, **run.values)
+    run.account.length, nominal = run.replay.places.length, Account(run.account.config).slots
+    assert nominal <= run.account.length <= max(nominal, 1.5 * before)
+    assert run.account.held()[-len(held) :] == held
+
+
+@pytest.mark.parametrize("capacity", [21, 29, 60])
+@pytest.mark.parametrize("compress", [False, True])
+def test_a_ring_that_has_wrapped_grows_too(tmp_path, capacity, compress):
+    for more in range(0, 25, 4):  # wherever it stands
+        run = Run(tmp_path / str(more), compress=compress)
+        run.play(9, 9, 0)
+        run.play(more)
+        lengthen(run, capacity)
+        check(run.replay, run.account)
+        for length in (0, 7, 9, 2, 9, 9):
+            run.play(length)
+            check(run.replay, run.account)
+        run.replay = make(run.directory, **run.values)
+        check(run.replay, run.account)
+        lengthen(run, 3 * capacity)
+        run.play(*[8] * 9)
+        check(run.replay, run.account)
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_it_grows_and_goes_back_to_its_last_checkpoint(tmp_path, compress):
+    for more in (0, 2, 5, 9):
+        run = Run(tmp_path / str(more), compress=compress)
+        run.play(9, 9, 5)
+        run.replay.flush()
+        state, moments, lost = run.replay.state_dict(), len(run.account.moments), run.account.lost
+        run.replay.settle()
+        run.play(*[2] * more)  # what was held is overwritten, and the process dies
+        run.values["capacity"] = 50
+        run.account.config = config(**run.values)
+        run.go_back(state, moments)
+        run.account.length, run.account.lost = run.replay.places.length, lost
+        check(run.replay, run.account)
+        run.play(*[9] * 8)
+        check(run.replay, run.account)
+
+
+@pytest.mark.parametrize("at", [0, 1, 5])
+def test_what_dies_while_it_grows_is_as_it_was(tmp_path, monkeypatch, at):
+    """At a full disk, or by a signal, however far the files have come."""
+    run = Run(tmp_path)
+    run.play(9, 9, 4)
+    moved = 0
+
+    class Dying(mmap.mmap):
+        def move(self, to: int, begin: int, count: int) -> None:
+            nonlocal moved
+            moved += 1
+            if moved > at:
+                raise KeyboardInterrupt
+            super().move(to, begin, count)
+
+    monkeypatch.setattr(storage.mmap, "mmap", Dying)
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path, capacity=70)
+    monkeypatch.undo()
+    run.replay = make(tmp_path)
     check(run.replay, run.account)
-    run.play(5, 4)
+    lengthen(run, 70)
     check(run.replay, run.account)
 
 

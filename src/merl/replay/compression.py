@@ -17,6 +17,8 @@ import lz4.block
 import numpy as np
 from numpy.typing import NDArray
 
+from merl.replay.places import Places
+
 STAGES = (1, 5, 25)
 """A background is made after so many episodes' first pictures."""
 
@@ -32,11 +34,12 @@ def reserved_bytes(picture_bytes: int) -> int:
 class CompressedPictures:
     """The pictures of one key.
 
-    A position in the ring counts on and on; byte p lies at p modulo the ring's length. No picture
-    reaches across the end.
+    A position in the ring counts on and on; `places` says where its byte lies. No picture reaches
+    across the end.
 
     Args:
         ring: the bytes.
+        places: where they lie.
         spans: where each slot's picture begins, as such a position, and its bytes: (slots, 2).
         shape: of a picture, uint8.
         backgrounds: the file of the backgrounds; without one they are kept in memory alone.
@@ -45,12 +48,13 @@ class CompressedPictures:
     def __init__(
         self,
         ring: NDArray[np.uint8],
+        places: Places,
         spans: NDArray[np.int64],
         shape: tuple[int, ...],
         backgrounds: Path | None,
     ) -> None:
         self.shape = shape
-        self._ring, self._spans, self._file = ring, spans, backgrounds
+        self._ring, self._places, self._spans, self._file = ring, places, spans, backgrounds
         self._size = int(np.prod(shape))
         self._head = 0  # where the next picture may begin
         self._starts: list[NDArray[np.uint8]] = []
@@ -99,8 +103,7 @@ class CompressedPictures:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """See `pictures.Pictures`."""
         begin, (end, count) = self._spans[first, 0], self._spans[last].T
-        length = len(self._ring)
-        return begin % length, end % length + count
+        return self._places.of(begin), self._places.of(end) + count
 
     def stacks(self, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
         """See `pictures.Pictures`: each is decoded into the place of the one before."""
@@ -112,7 +115,7 @@ class CompressedPictures:
             yield frames
 
     def _decode(self, begin: int, count: int, out: NDArray[np.uint8]) -> None:
-        at, kept = begin % len(self._ring), self._ring.data
+        at, kept = self._places.of(begin), self._ring.data
         difference = lz4.block.decompress(kept[at + 1 : at + count], uncompressed_size=self._size)
         np.add(np.frombuffer(difference, np.uint8), self._backgrounds[kept[at]], out=out)
 
@@ -136,13 +139,12 @@ class CompressedPictures:
 
     def _begin(self, count: int) -> int:
         """Where so many bytes in a row are next."""
-        length = len(self._ring)
-        room = length - self._head % length
+        room = len(self._ring) - self._places.of(self._head)
         return self._head if count <= room else self._head + room
 
     def _bytes(self, slot: int) -> NDArray[np.uint8]:
         begin, count = self._spans[slot].tolist()
-        at = begin % len(self._ring)
+        at = self._places.of(begin)
         return self._ring[at : at + count]
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError
 from merl.replay.compression import CompressedPictures
+from merl.replay.places import Places
 
 _FILE = "overwritten.journal"
 _LOG = logging.getLogger(__name__)
@@ -30,6 +31,7 @@ class Journal:
     Args:
         directory: the ring's.
         data: the ring's arrays, (slots, *shape) each.
+        places: where in them entry number moment - 1 lies.
         pictures: its compressed pictures, by the name of their field.
 
     Raises:
@@ -40,9 +42,10 @@ class Journal:
         self,
         directory: Path,
         data: Mapping[str, NDArray[Any]],
+        places: Places,
         pictures: Mapping[str, CompressedPictures],
     ) -> None:
-        self._data, self._pictures = data, pictures
+        self._data, self._places, self._pictures = data, places, pictures
         fields = [("by", "<i8"), *((name, a.dtype, a.shape[1:]) for name, a in data.items())]
         self._row = np.zeros(1, np.dtype(fields))  # without padding: bytes as they lie in the file
         self._kept = True
@@ -84,10 +87,9 @@ class Journal:
 
     def undo(self, moments: int) -> None:
         """Put back what moments after number `moments` have overwritten, the newest first."""
-        slots = len(self._data["moment"])
         for row, pictures in reversed(list(self._records())):
             if row["by"] > moments:
-                slot = (row["moment"] - 1) % slots
+                slot = self._places.of(int(row["moment"]) - 1)
                 for name, array in self._data.items():
                     array[slot] = row[name]
                 for name, kept in pictures.items():

@@ -27,40 +27,46 @@ def bytes_on_device(rings: Sequence[Replay]) -> int:
 
 
 class OnDevice:
-    """Rings of the same shape, on a device.
+    """Rings of the same environment, one behind the other, on a device.
 
     Args:
         rings: on the host; without compression.
         device: where the copy lies.
-
-    Raises:
-        ValueError: they are not of the same size.
     """
 
     def __init__(self, rings: Sequence[Replay], device: torch.device) -> None:
         first = rings[0]
-        if any((ring.slots, ring.capacity) != (first.slots, first.capacity) for ring in rings):
-            raise ValueError("the rings must be of the same size")
         self._rings, self._device = rings, device
-        self._keys, self._slots, self._capacity = first.keys, first.slots, first.capacity
+        self._keys, self._capacity = first.keys, first.capacity
+        lengths = [ring.places.length for ring in rings]
+        self._first_slots = [sum(lengths[:index]) for index in range(len(rings))]
+        self._bases = torch.tensor(self._first_slots, device=device)
+        self._slots = torch.tensor(lengths, device=device)
         self._fields = {
             name: torch.empty(
-                (len(rings) * self._slots, *array.shape[1:]),
+                (sum(lengths), *array.shape[1:]),
                 dtype=torch.from_numpy(array[:0]).dtype,
                 device=device,
             )
             for name, array in first.arrays().items()
         }
         self._sources = torch.zeros(len(rings) * self._capacity, dtype=torch.int64, device=device)
-        # Of each ring: its first step that can be sampled, its steps and its moments so far.
+        # Of each ring: its first step that can be sampled, its steps so far, and its newest moment,
+        # counted from the one that lies in its first slot.
         self._counts = torch.zeros((len(rings), 3), dtype=torch.int64, device=device)
         self._told = torch.zeros_like(self._counts, device="cpu")
         self._there = [(0, 0)] * len(rings)  # moments and steps that were brought over
-        self._sampler = Sampler(self._fields, self._slots, first.config)
+        self._sampler = Sampler(self._fields, first.config)
 
     def follow(self) -> None:
         """Bring over what the rings have taken in since the last time."""
-        counts = torch.tensor([ring.counts() for ring in self._rings])
+        counts = torch.tensor(
+            [
+                (*counts, moments - ring.places.origin)
+                for ring in self._rings
+                for *counts, moments in [ring.counts()]
+            ]
+        )
         if torch.equal(counts, self._told):
             return
         self._told = counts
@@ -69,12 +75,13 @@ class OnDevice:
         ):
             had_moments, had_steps = self._there[index]
             arrays = {name: torch.from_numpy(array) for name, array in ring.arrays().items()}
-            for part in _parts(had_moments, moments, self._slots):
+            for part in _parts(had_moments, moments, ring.places.length):
+                at = self._first_slots[index] + part.start
                 for name, array in arrays.items():
-                    self._bring(array[part], self._fields[name], index * self._slots + part.start)
-            sources = torch.from_numpy(ring.sources)
+                    self._bring(array[part], self._fields[name], at)
             for part in _parts(had_steps, steps, self._capacity):
-                self._bring(sources[part], self._sources, index * self._capacity + part.start)
+                sources = torch.from_numpy(ring.sources[part] - ring.places.origin)
+                self._bring(sources, self._sources, index * self._capacity + part.start)
             self._there[index] = (moments, steps)
         self._bring(counts, self._counts, 0)
 
@@ -101,7 +108,7 @@ class OnDevice:
         """The samples that start at these steps of these rings, each int64 (B,)."""
         source = self._sources[ring * self._capacity + step % self._capacity]
         newest = self._counts[ring, 2]
-        picks = self._sampler.pick(source, newest, base=ring * self._slots)
+        picks = self._sampler.pick(source, newest, self._bases[ring], self._slots[ring])
         now, then = (
             {key: self._sampler.observed(name, slots) for key, name in self._keys.items()}
             for slots in (picks.now, picks.then)

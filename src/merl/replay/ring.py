@@ -2,7 +2,7 @@
 
 One slot holds one *moment*: what was seen, and the action, reward and discount that led there. An
 episode of T steps is T + 1 moments in a row, the first of which was led to by nothing. Moments are
-numbered 1, 2, 3, ... as they come; moment i lies in slot (i - 1) mod slots.
+numbered 1, 2, 3, ... as they come; moment i is entry i - 1 of the slots (`places.py`).
 
     moment        7      8      9     10     11     12
     position      0      1      2      3      0      1      in its episode; 0 begins one
@@ -34,6 +34,7 @@ from merl.replay.journal import Journal
 from merl.replay.pictures import Pictures, RawPictures, ReadAhead, as_it_is, copied
 from merl.replay.sampling import Picks, Sampler
 from merl.replay.storage import (
+    Layout,
     check_value,
     field_name,
     fields_of,
@@ -55,7 +56,7 @@ class Replay:
     Attributes:
         config: what is kept and how it is sampled.
         capacity: steps that are kept.
-        slots: of the ring.
+        places: where the moments lie; a moment's entry is its number less one.
         keys: the field that each of an observation's keys is kept in.
         sources: step i led away from moment sources[i mod capacity].
     """
@@ -78,7 +79,7 @@ class Replay:
             action_space: a vector.
             directory: where the ring lies, memory-mapped; without one it lies in memory.
             capacity: steps that are kept, in place of the config's. A ring that is opened again
-                grows to it; one that has wrapped stays as long as it is.
+                grows to it.
 
         Raises:
             MerlError: a space that cannot be kept, a capacity that does not fit, a directory that
@@ -97,8 +98,9 @@ class Replay:
             arrays = {
                 name: np.zeros((slots, *field.shape), field.dtype) for name, field in fields.items()
             }
+            layout = Layout.of(fields, slots)
         else:
-            self._files = open_files(directory, fields, slots, self.capacity)
+            self._files, layout = open_files(directory, fields, slots, self.capacity)
             arrays = {
                 name: np.frombuffer(self._files[name], field.dtype).reshape(-1, *field.shape)
                 for name, field in fields.items()
@@ -107,6 +109,7 @@ class Replay:
         self._compressed = {
             name: CompressedPictures(
                 arrays.pop(name).reshape(-1),
+                layout.bytes[name],
                 arrays[span_name(key)],
                 observation_space[key].shape or (),
                 None if directory is None else directory / f"{name}.background",
@@ -124,10 +127,10 @@ class Replay:
         }
         self._journal: Journal | None = None
         if directory is not None:
-            self._journal = Journal(directory, self._data, self._compressed)
-        self.slots = len(self._data["moment"])
+            self._journal = Journal(directory, self._data, layout.slots, self._compressed)
+        self.places = layout.slots
         fields_there = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        self._sampler = Sampler(fields_there, self.slots, config)
+        self._sampler = Sampler(fields_there, config)
         self._moments = self._steps = 0  # ever written
         self._first = 0  # the oldest step that can be sampled
         self._oldest = 1  # the oldest moment that is held
@@ -206,9 +209,10 @@ class Replay:
             raise ValueError("the replay is empty: add a step before sampling")
         steps = rng.integers(self._first, self._steps, size=batch_size)
         picks = self._sampler.pick(
-            torch.from_numpy(self.sources[steps % self.capacity]),
-            newest=torch.tensor([self._moments]),
+            torch.from_numpy(self.sources[steps % self.capacity] - self.places.origin),
+            newest=torch.tensor([self._moments - self.places.origin]),
             base=torch.tensor([0]),
+            slots=torch.tensor([self.places.length]),
         )
         self._ahead.begin()
         if self._files and self._ahead.is_wanted:
@@ -233,7 +237,7 @@ class Replay:
         return self._data
 
     def counts(self) -> tuple[int, int, int]:
-        """The first step that can be sampled, and how many steps and moments there were."""
+        """The first step that can be sampled, how many steps there were, the newest moment."""
         return self._first, self._steps, self._moments
 
     def flush(self) -> None:
@@ -275,7 +279,7 @@ class Replay:
 
     def _slot(self, moment: int) -> int:
         """Where the ring holds a moment."""
-        return (moment - 1) % self.slots
+        return self.places.of(moment - 1)
 
     def _write(
         self,
@@ -313,7 +317,7 @@ class Replay:
         ends = {name: self._compressed[name].end_of(picture) for name, picture in kept.items()}
         while self._oldest < moment:
             slot = self._slot(self._oldest)
-            if self._oldest > moment - self.slots:
+            if self._oldest > moment - self.places.length:
                 if not any(self._compressed[n].overwritten(slot, end) for n, end in ends.items()):
                     break
                 self._tell_of_less()
@@ -354,8 +358,8 @@ class Replay:
         """
         stamps = self._data["moment"]
         stamps[stamps > moments] = 0  # else they would pass for what follows, if opened once more
-        numbers = np.arange(max(0, moments - self.slots) + 1, moments + 1)
-        slots = (numbers - 1) % self.slots
+        numbers = np.arange(max(0, moments - self.places.length) + 1, moments + 1)
+        slots = self.places.of(numbers - 1)
         missing = numbers[stamps[slots] != numbers]  # overwritten since, or only half written
         self._oldest = int(missing[-1] if missing.size else moments - len(numbers)) + 1
         for pictures in self._compressed.values():

@@ -38,43 +38,47 @@ class Sampler:
     """Finds what belongs to a step, in one ring or in several that lie behind one another.
 
     Args:
-        fields: the arrays by name, each (rings x slots, ...); see `storage.fields_of`.
-        slots: of one ring.
+        fields: the arrays by name, of several rings one behind the other; see `storage.fields_of`.
         config: stack, n and discount.
     """
 
-    def __init__(self, fields: Mapping[str, Tensor], slots: int, config: ReplayConfig) -> None:
-        self._fields, self._slots = fields, slots
+    def __init__(self, fields: Mapping[str, Tensor], config: ReplayConfig) -> None:
+        self._fields = fields
         device = fields["position"].device
         self._ahead = torch.arange(config.n_step, device=device)
         self._back = torch.arange(config.frame_stack - 1, -1, -1, device=device)
         powers = [config.discount**power for power in range(config.n_step + 1)]
         self._powers = torch.tensor(powers, dtype=torch.float64, device=device)
 
-    def pick(self, source: Tensor, newest: Tensor, base: Tensor) -> Picks:
+    def pick(self, source: Tensor, newest: Tensor, base: Tensor, slots: Tensor) -> Picks:
         """Lay out the samples that start at moments `source`.
 
         Args:
-            source: numbers of moments, int64 (B,).
+            source: numbers of moments, int64 (B,), where number 1 lies in the first slot.
             newest: the newest moment of their ring, int64 (B,) or (1,).
             base: the first slot of their ring, likewise.
+            slots: of their ring, likewise.
         """
-        fields, base, newest = self._fields, base[:, None], newest[:, None]
-        moments = source[:, None]
-        begun = moments - fields["position"][self._slot(moments, base)]  # the episode's first
+        fields, newest, moments = self._fields, newest[:, None], source[:, None]
+        base, length = base[:, None], slots[:, None]
+
+        def slot(moment: Tensor) -> Tensor:
+            return (moment - 1) % length + base
+
+        begun = moments - fields["position"][slot(moments)]  # the episode's first
         ahead = moments + 1 + self._ahead  # (B, n): what r_t, r_{t+1}, ... led to
-        slots = self._slot(ahead, base)
-        same = ((ahead <= newest) & (fields["position"][slots] > 0)).long().cumprod(dim=1)
+        led_to = slot(ahead)
+        same = ((ahead <= newest) & (fields["position"][led_to] > 0)).long().cumprod(dim=1)
         steps = same.sum(dim=1)  # (B,): m
         end = moments + steps[:, None]
         # Slots beyond the newest moment may never have been written: no number times 0 is none.
-        paid = torch.where(same.bool(), fields["reward"][slots], 0.0)
+        paid = torch.where(same.bool(), fields["reward"][led_to], 0.0)
         rewards = paid * self._powers[:-1]  # float64
-        last = fields["discount"][self._slot(end, base)[:, 0]]
+        last = fields["discount"][slot(end)[:, 0]]
         return Picks(
-            now=self._slot(torch.maximum(moments - self._back, begun), base),
-            then=self._slot(torch.maximum(end - self._back, begun), base),
-            action=slots[:, 0],
+            now=slot(torch.maximum(moments - self._back, begun)),
+            then=slot(torch.maximum(end - self._back, begun)),
+            action=led_to[:, 0],
             reward=rewards.sum(dim=1).float(),
             discount=(self._powers[steps] * last).float(),
         )
@@ -91,6 +95,3 @@ class Sampler:
     def action(self, picks: Picks) -> Tensor:
         """a_t, float32 (B, A)."""
         return self._fields["action"].index_select(0, picks.action)
-
-    def _slot(self, moment: Tensor, base: Tensor) -> Tensor:
-        return (moment - 1) % self._slots + base

@@ -4,7 +4,7 @@
 types, shapes and the number of slots; it is written last, so a directory that has it is whole. An
 observation's key is quoted as in a URL: `observation.image.bin`, `observation.arm%2Fjoints.bin`.
 Compressed pictures lie behind one another in theirs, `observation.image.span.bin` says where
-(`compression.py`).
+(`compression.py`). Which slot, or which byte, the ring begins with is an origin (`places.py`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 
 from merl.core import MerlError, is_image, is_vector
 from merl.replay.compression import reserved_bytes
+from merl.replay.places import Move, Places
 from merl.resources import reserve_file
 
 _FORMAT = 1
@@ -42,6 +43,35 @@ class Field:
     def bytes(self) -> int:
         """Bytes of one slot."""
         return self.dtype.itemsize * math.prod(self.shape)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where everything lies.
+
+    Attributes:
+        slots: of the ring; a moment's entry is its number less one.
+        bytes: of compressed pictures, by field.
+    """
+
+    slots: Places
+    bytes: Mapping[str, Places]
+
+    @classmethod
+    def of(
+        cls,
+        fields: Mapping[str, Field],
+        slots: int,
+        origin: int = 0,
+        byte_origins: Mapping[str, int] | None = None,
+    ) -> Layout:
+        """That of so many slots."""
+        origins = byte_origins or {}
+        compressed = [name for name in fields if f"{name}.span" in fields]
+        return cls(
+            Places(slots, origin),
+            {name: Places(slots * fields[name].bytes, origins.get(name, 0)) for name in compressed},
+        )
 
 
 def fields_of(
@@ -102,40 +132,75 @@ def check_value(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, .
 
 def open_files(
     directory: Path, fields: dict[str, Field], slots: int, capacity: int
-) -> dict[str, mmap.mmap]:
-    """Create the files, or grow those that are there where they are too short, and map them.
-
-    A ring that has wrapped stays as long as it is: its oldest moments lie behind its newest.
+) -> tuple[dict[str, mmap.mmap], Layout]:
+    """Create the files, or lengthen those that are there where they are too short, and map them.
 
     Raises:
         MerlError: the disk is full, the directory cannot be written, or it holds something else.
             What was created is removed again, what was there is as it was.
     """
     header = directory / _HEADER
-    header_text = _header_text(fields, slots, capacity)
-    held, wrapped = _held_slots(header, fields, header_text)
-    slots = held if wrapped else slots
+    before = _read_layout(header, fields)
+    held = 0 if before is None else before.slots.length
+    layout, moves = Layout.of(fields, slots), dict[str, Move]()
+    if before is not None:
+        layout, moves = _lengthened(directory, fields, before, slots)
     paths = {name: directory / f"{name}.bin" for name in fields}
-    before = {paths[name]: held * field.bytes for name, field in fields.items()}
-    sizes = {paths[name]: max(slots, held) * field.bytes for name, field in fields.items()}
+    lengths = {paths[name]: held * field.bytes for name, field in fields.items()}
+    sizes = {name: layout.slots.length * field.bytes for name, field in fields.items()}
     new_folders = [path for path in (directory, *directory.parents) if not path.exists()]
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for path, size in sizes.items():
+        for name, path in paths.items():
             if not held:  # there without a header: left by a process that died while reserving
                 path.unlink(missing_ok=True)
-            reserve_file(path, size)
-        files = {name: _map(path, sizes[path]) for name, path in paths.items()}
-        if slots > held:
-            _write_text(header, header_text)
+            reserve_file(path, sizes[name])
+        files = {name: _map(path, sizes[name]) for name, path in paths.items()}
+        if layout != before:
+            for name, move in moves.items():
+                files[name].move(move.to, move.begin, move.entries)
+                files[name].flush()
+            _write_text(header, _header_text(fields, layout, capacity))
     except BaseException as error:
         with suppress(OSError):
-            _undo(before, new_folders)
+            _undo(lengths, new_folders)
         if isinstance(error, OSError):
             why = error.strerror or error
             raise MerlError(f"cannot keep a replay in {directory}: {why}") from error
         raise
-    return files
+    return files, layout
+
+
+def _lengthened(
+    directory: Path, fields: Mapping[str, Field], layout: Layout, slots: int
+) -> tuple[Layout, dict[str, Move]]:
+    """A ring's layout with so many slots, or a few more if need be, and what to move for it.
+
+    Moves are in bytes, by field. A ring that has enough slots stays as it is.
+    """
+    held = layout.slots.length
+    if slots <= held:
+        return layout, {}
+    moments = int(np.fromfile(directory / "moment.bin", "<i8", held).max(initial=0))
+    ends = {}  # of the compressed pictures
+    for name in layout.bytes:
+        spans = np.fromfile(directory / f"{name}.span.bin", "<i8", 2 * held).reshape(-1, 2)
+        ends[name] = int(spans[layout.slots.of(moments - 1)].sum()) if moments else 0
+    least = [layout.slots.least_longer(moments)]
+    for name, places in layout.bytes.items():
+        least.append(-(-places.least_longer(ends[name]) // fields[name].bytes))
+    slots = max(slots, *least)
+    places, move = layout.slots.longer(slots, moments)
+    moves, of_bytes = {}, {}
+    for name, field in fields.items():
+        if name not in layout.bytes:
+            if move is not None:
+                moves[name] = Move(*(field.bytes * part for part in move))
+            continue
+        of_bytes[name], its = layout.bytes[name].longer(slots * field.bytes, ends[name])
+        if its is not None:
+            moves[name] = its
+    return Layout(places, of_bytes), moves
 
 
 def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:
@@ -149,52 +214,58 @@ def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:
         folder.rmdir()
 
 
-def _held_slots(header: Path, fields: dict[str, Field], text: str) -> tuple[int, bool]:
-    """Slots of the ring that lies there, 0 if there is none, and whether it has wrapped.
+def _read_layout(header: Path, fields: dict[str, Field]) -> Layout | None:
+    """That of the ring that lies there; None if there is none.
 
     Raises:
         MerlError: it cannot be gone on with.
     """
     if not header.exists():
-        return 0, False
-    directory, wanted = header.parent, json.loads(text)
+        return None
+    directory = header.parent
     try:
         found = json.loads(header.read_text())
         held = int(found["slots"])
-        same = all(found[name] == wanted[name] for name in ("format", "fields"))
+        layout = Layout.of(
+            fields,
+            held,
+            int(found.get("origin", 0)),
+            {name: int(origin) for name, origin in found.get("byte_origins", {}).items()},
+        )
+        same = found["format"] == _FORMAT and found["fields"] == _described(fields)
         whole = all(
             (directory / f"{name}.bin").stat().st_size >= held * field.bytes
             for name, field in fields.items()
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise MerlError(f"{directory} holds a damaged replay: give another folder") from error
     if not same:
         raise MerlError(
             f"{directory} holds a replay of other observations or actions: give another folder"
         )
-    if not whole:
+    if not whole or held < 1:
         raise MerlError(f"{directory} holds a truncated replay: give another folder")
-    newest = np.fromfile(directory / "moment.bin", "<i8", held).max(initial=0)
-    return held, bool(newest > held) or _bytes_wrapped(directory, fields, held)
+    return layout
 
 
-def _bytes_wrapped(directory: Path, fields: dict[str, Field], held: int) -> bool:
-    """Whether compressed pictures have come to the end of their bytes."""
-    for name, field in fields.items():
-        spans = directory / f"{name}.span.bin"
-        if f"{name}.span" in fields:
-            ends = np.fromfile(spans, "<i8", 2 * held).reshape(-1, 2).sum(axis=1)
-            if ends.max(initial=0) > held * field.bytes:
-                return True
-    return False
-
-
-def _header_text(fields: dict[str, Field], slots: int, capacity: int) -> str:
-    layout = {
-        name: {"dtype": field.dtype.str, "shape": field.shape} for name, field in fields.items()
+def _header_text(fields: dict[str, Field], layout: Layout, capacity: int) -> str:
+    header = {
+        "format": _FORMAT,
+        "capacity": capacity,
+        "slots": layout.slots.length,
+        "origin": layout.slots.origin,
+        "byte_origins": {name: places.origin for name, places in layout.bytes.items()},
+        "fields": _described(fields),
     }
-    header = {"format": _FORMAT, "capacity": capacity, "slots": slots, "fields": layout}
     return json.dumps(header, indent=2) + "\n"
+
+
+def _described(fields: dict[str, Field]) -> dict[str, Any]:
+    """As JSON has it."""
+    return {
+        name: {"dtype": field.dtype.str, "shape": list(field.shape)}
+        for name, field in fields.items()
+    }
 
 
 def _write_text(path: Path, text: str) -> None:

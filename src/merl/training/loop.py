@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -232,9 +233,14 @@ def _actions(
     return Fetched(agent.act(side_by_side(stage.stacks), explore=True).float())
 
 
+def updates_due(steps: int, updates_per_step: float) -> int:
+    """How many updates so many steps ask for, exactly: 0.57 is meant, not the float nearest it."""
+    return int(steps * Fraction(str(updates_per_step)))
+
+
 def _learn(update: Update, progress: Progress, config: TrainConfig) -> dict[str, Tensor]:
     """The updates that are due: after t steps, (t - seed_steps) updates_per_step in all."""
-    due = int((progress.step - config.seed_steps) * config.updates_per_step)
+    due = updates_due(progress.step - config.seed_steps, config.updates_per_step)
     metrics: dict[str, Tensor] = {}
     while progress.updates < due:
         metrics = update()

@@ -657,9 +657,10 @@ def test_it_grows_and_goes_back_to_its_last_checkpoint(tmp_path, compress):
         check(run.replay, run.account)
 
 
+@pytest.mark.parametrize("killed", [False, True])
 @pytest.mark.parametrize("at", [0, 1, 5])
-def test_what_dies_while_it_grows_is_as_it_was(tmp_path, monkeypatch, at):
-    """At a full disk, or by a signal, however far the files have come."""
+def test_what_dies_while_it_grows_is_as_it_was(tmp_path, monkeypatch, at, killed):
+    """By an exception, or at once, with no time to tidy up; however far the files have come."""
     run = Run(tmp_path)
     run.play(9, 9, 4)
     moved = 0
@@ -673,6 +674,8 @@ def test_what_dies_while_it_grows_is_as_it_was(tmp_path, monkeypatch, at):
             super().move(to, begin, count)
 
     monkeypatch.setattr(storage.mmap, "mmap", Dying)
+    if killed:
+        monkeypatch.setattr(storage, "_undo", lambda *_: None)
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path, capacity=70)
     monkeypatch.undo()

@@ -15,7 +15,7 @@ from merl.replay.on_device import OnDevice
 from merl.training import loop
 from merl.training.acting import Here
 from merl.training.config import TrainConfig
-from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train
+from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train, updates_due
 from merl.training.rollout import Episode, Fetched, FrameStack
 from merl.training.updating import UpdateFromHost, UpdateOnDevice, update_from_host
 from toy import DotEnv
@@ -59,12 +59,20 @@ class Parts:
         return torch.cat([p.detach().flatten() for p in self.agent.networks.parameters()])
 
 
-@pytest.mark.parametrize("ratio", [0.0, 0.25, 0.5, 1.0, 2.0])
-def test_updates_per_step_are_held_exactly(ratio: float) -> None:
-    parts = Parts(dataclasses.replace(CONFIG, updates_per_step=ratio))
+@pytest.mark.parametrize("hundredths", [0, 25, 50, 100, 115, 200])
+def test_updates_per_step_are_held_exactly(hundredths: int) -> None:
+    parts = Parts(dataclasses.replace(CONFIG, updates_per_step=hundredths / 100))
     for moment in parts.run():
-        assert moment.updates == max(0, int((moment.step - 20) * ratio))
+        assert moment.updates == max(0, (moment.step - 20) * hundredths // 100)
     assert moment.step == 60
+
+
+def test_a_ratio_is_taken_as_it_is_written() -> None:
+    """600 times 0.57 is 342; of floats it is a little less."""
+    for hundredths in range(300):
+        for steps in (1, 20, 100, 600, 1_000_000):
+            assert updates_due(steps, hundredths / 100) == steps * hundredths // 100
+    assert updates_due(-5, 0.5) <= 0
 
 
 def test_the_agent_is_told_the_step() -> None:

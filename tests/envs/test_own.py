@@ -225,6 +225,7 @@ class Misgiving(Given):
         (lambda o: (o | {"eye": np.zeros((31, 32, 3), np.uint8)}, 0.0, False, False, {}),
          r"'eye' has shape \(31, 32, 3\)"),
         (lambda o: 1 / 0, r"step raised ZeroDivisionError: division by zero \(test_own.py, line"),
+        (lambda o: sys.exit("no arm"), r"step raised SystemExit: no arm \(test_own.py, line"),
     ],
 )  # fmt: skip
 def test_what_is_no_step_is_told(step: Any, says: str) -> None:

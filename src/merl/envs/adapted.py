@@ -178,7 +178,7 @@ def failing(what: str) -> Iterator[None]:
         yield
     except MerlError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # drivers do call sys.exit
         raise EnvironmentFailed(f"the environment's {what} raised {in_one_line(error)}") from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from gymnasium import spaces
 import merl
 from merl.core import Batch, Transition
 from merl.replay import Replay, ReplayConfig, replay_bytes
-from merl.replay.compression import STAGES, CompressedPictures
+from merl.replay.backgrounds import STAGES, Backgrounds
+from merl.replay.compression import CompressedPictures
 from merl.replay.places import Places
 
 SIDE = 16
@@ -30,15 +32,20 @@ def noise(number: int) -> dict[str, np.ndarray]:
     return {"image": rng.integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)}
 
 
-def play(replay: Replay, begin: int, steps: int, length: int = 7) -> None:
+Observe = Callable[[int], dict[str, np.ndarray]]
+
+
+def play(
+    replay: Replay, begin: int, steps: int, length: int = 7, observe: Observe = noise
+) -> None:
     """Moments `begin`, ...: the picture has the moment's number, the action its step's."""
     for moment in range(begin, begin + steps):
         if moment % length == 0:
-            replay.begin(noise(moment))
+            replay.begin(observe(moment))
         else:
             action = np.array([moment / 1000], np.float32)
             last = moment % length == length - 1
-            replay.add(Transition(action, float(moment), 1.0, noise(moment), last))
+            replay.add(Transition(action, float(moment), 1.0, observe(moment), last))
 
 
 class Every:
@@ -179,7 +186,7 @@ def test_it_grows_where_its_bytes_have_wrapped(tmp_path: Path, capacity: int, pl
 def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     still = rng.integers(0, 256, (8, 8, 3)).astype(np.uint8)
-    file = tmp_path / "background"
+    file = tmp_path / "starts"
     pictures = CompressedPictures(
         np.zeros(100_000, np.uint8),
         Places(100_000),
@@ -195,8 +202,67 @@ def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> 
         kept = pictures.encode(picture)
         pictures.write(number, kept)
         sizes.append(len(kept))
-        pictures.begun(picture)
+        pictures.backgrounds.begun(picture)
         ((decoded,),) = pictures.stacks(np.array([[number]]))
         np.testing.assert_array_equal(decoded, picture)
     assert sizes[-1] < sizes[0] / 3
-    assert file.stat().st_size == len(STAGES) * still.nbytes
+    assert file.stat().st_size == STAGES[-1] * still.nbytes
+
+
+def still_life(moment: int) -> dict[str, np.ndarray]:
+    """A noisy wall, and something small before it that is elsewhere each time."""
+    picture = noise(0)["image"]
+    row, column = np.random.default_rng(moment).integers(0, SIDE - 3, 2)
+    picture[row : row + 3, column : column + 3] = moment % 256
+    return {"image": picture}
+
+
+@pytest.mark.parametrize("killed", [0, 2, 4, 15, 24, 30])
+def test_one_gone_back_to_its_checkpoint_keeps_the_same_steps_as_one_that_was_never_killed(
+    tmp_path: Path, killed: int
+) -> None:
+    small = config(capacity=40)
+    whole = Replay(small, NOISE, ACTIONS, directory=tmp_path / "whole")
+    replay = Replay(small, NOISE, ACTIONS, directory=tmp_path / "killed")
+    play(whole, 0, 7 * killed, observe=still_life)
+    play(replay, 0, 7 * killed, observe=still_life)
+    replay.flush()
+    state = replay.state_dict()
+    replay.settle()
+    play(replay, 7 * killed, 7 * 9, observe=still_life)
+    replay = Replay(small, NOISE, ACTIONS, directory=tmp_path / "killed")
+    replay.load_state_dict(state)
+    for episode in range(killed, 40):
+        play(whole, 7 * episode, 7, observe=still_life)
+        play(replay, 7 * episode, 7, observe=still_life)
+        assert_same(everything(whole), everything(replay))
+    for file in (tmp_path / "whole").glob("*.image*"):
+        assert file.read_bytes() == (tmp_path / "killed" / file.name).read_bytes()
+
+
+def test_backgrounds_are_made_of_what_the_disk_took(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backgrounds = Backgrounds(4, tmp_path / "starts")
+    pictures = np.arange(24, dtype=np.uint8).reshape(6, 4)
+    backgrounds.begun(pictures[0])
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", lambda _: (_ for _ in ()).throw(OSError(28, "full")))
+        backgrounds.begun(pictures[1])
+    for picture in pictures[2:]:
+        backgrounds.begun(picture)
+    again = Backgrounds(4, tmp_path / "starts")
+    assert len(again) == len(backgrounds) == 3
+    for number in range(3):
+        np.testing.assert_array_equal(again[number], backgrounds[number])
+    np.testing.assert_array_equal(again[2], np.median(pictures[[0, 2, 3, 4, 5]], axis=0))
+
+
+def test_a_run_of_before_stays_with_the_backgrounds_that_it_kept(tmp_path: Path) -> None:
+    former = np.arange(8, dtype=np.uint8)
+    former.tofile(tmp_path / "image.background")
+    backgrounds = Backgrounds(4, tmp_path / "image.starts")
+    backgrounds.begun(np.zeros(4, np.uint8))
+    backgrounds.go_back(0)
+    assert len(backgrounds) == 3
+    np.testing.assert_array_equal(backgrounds[2], former[4:])

@@ -1,27 +1,21 @@
 """Pictures kept compressed, without loss: what differs from the background, by LZ4.
 
 A camera that stands still sees mostly what it saw before. So a picture is kept as its difference
-from a *background*, the median of some episodes' first pictures, in which the arm, each time
-elsewhere, disappears. Pictures take as many bytes as they take, one behind the other in a ring of
+from a *background* (`backgrounds.py`). Pictures take as many bytes as they take, one behind the other in a ring of
 bytes; where they need more than was reserved, the ring holds fewer steps.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import lz4.block
 import numpy as np
 from numpy.typing import NDArray
 
+from merl.replay.backgrounds import Backgrounds
 from merl.replay.places import Places
-
-STAGES = (1, 5, 25)
-"""A background is made after so many episodes' first pictures."""
-
 
 def reserved_bytes(picture_bytes: int) -> int:
     """Bytes that are reserved for a picture, on the average.
@@ -42,7 +36,10 @@ class CompressedPictures:
         places: where they lie.
         spans: where each slot's picture begins, as such a position, and its bytes: (slots, 2).
         shape: of a picture, uint8.
-        backgrounds: the file of the backgrounds; without one they are kept in memory alone.
+        starts: the file that the backgrounds are made from; without one it is kept in memory.
+
+    Attributes:
+        backgrounds: what they are kept as a difference from.
     """
 
     def __init__(
@@ -51,23 +48,18 @@ class CompressedPictures:
         places: Places,
         spans: NDArray[np.int64],
         shape: tuple[int, ...],
-        backgrounds: Path | None,
+        starts: Path | None,
     ) -> None:
         self.shape = shape
-        self._ring, self._places, self._spans, self._file = ring, places, spans, backgrounds
+        self._ring, self._places, self._spans = ring, places, spans
         self._size = int(np.prod(shape))
         self._head = 0  # where the next picture may begin
-        self._starts: list[NDArray[np.uint8]] = []
-        self._backgrounds = [np.zeros(self._size, np.uint8)]
-        if backgrounds is not None and backgrounds.exists():
-            raw = np.fromfile(backgrounds, np.uint8)
-            whole = len(raw) // self._size
-            self._backgrounds += list(raw[: whole * self._size].reshape(whole, self._size))
+        self.backgrounds = Backgrounds(self._size, starts)
 
     def encode(self, picture: NDArray[np.uint8]) -> bytes:
         """A picture as it is kept: the number of its background, then the difference from it."""
-        number = len(self._backgrounds) - 1
-        difference = picture.reshape(-1) - self._backgrounds[number]  # wraps around, as wanted
+        number = len(self.backgrounds) - 1
+        difference = picture.reshape(-1) - self.backgrounds[number]  # wraps around, as wanted
         packed: bytes = lz4.block.compress(difference, store_size=False)
         return bytes([number]) + packed
 
@@ -117,25 +109,7 @@ class CompressedPictures:
     def _decode(self, begin: int, count: int, out: NDArray[np.uint8]) -> None:
         at, kept = self._places.of(begin), self._ring.data
         difference = lz4.block.decompress(kept[at + 1 : at + count], uncompressed_size=self._size)
-        np.add(np.frombuffer(difference, np.uint8), self._backgrounds[kept[at]], out=out)
-
-    def begun(self, picture: NDArray[np.uint8]) -> None:
-        """An episode begins so: after some of them the background is known better."""
-        made = len(self._backgrounds) - 1
-        if made == len(STAGES):
-            return
-        self._starts.append(picture.reshape(-1).copy())
-        if len(self._starts) < STAGES[made]:
-            return
-        background = np.median(np.stack(self._starts), axis=0).astype(np.uint8)
-        if self._file is not None:
-            try:
-                _append(self._file, background, made * self._size)
-            except OSError:  # a full disk: the one before will do
-                return
-        self._backgrounds.append(background)
-        if len(self._backgrounds) - 1 == len(STAGES):
-            self._starts.clear()
+        np.add(np.frombuffer(difference, np.uint8), self.backgrounds[kept[at]], out=out)
 
     def _begin(self, count: int) -> int:
         """Where so many bytes in a row are next."""
@@ -146,12 +120,3 @@ class CompressedPictures:
         begin, count = self._spans[slot].tolist()
         at = self._places.of(begin)
         return self._ring[at : at + count]
-
-
-def _append(path: Path, background: NDArray[Any], at: int) -> None:
-    """Have a background on the disk before any picture is kept as a difference from it."""
-    with path.open("ab") as file:
-        file.truncate(at)  # one that was cut short
-        file.write(background.tobytes())
-        file.flush()
-        os.fsync(file.fileno())

@@ -112,7 +112,7 @@ class Replay:
                 layout.bytes[name],
                 arrays[span_name(key)],
                 observation_space[key].shape or (),
-                None if directory is None else directory / f"{name}.background",
+                None if directory is None else directory / f"{name}.starts",
             )
             for key, name in self.keys.items()
             if span_name(key) in fields
@@ -152,7 +152,8 @@ class Replay:
         """
         self._write(observation, position=0, action=None, reward=0.0, discount=1.0)
         for name, pictures in self._compressed.items():
-            pictures.begun(next(observation[key] for key, n in self.keys.items() if n == name))
+            key = next(key for key, field in self.keys.items() if field == name)
+            pictures.backgrounds.begun(observation[key])
         self._open = True
 
     def add(self, transition: Transition) -> None:
@@ -251,9 +252,14 @@ class Replay:
         if self._journal is not None:
             self._journal.empty()
 
-    def state_dict(self) -> dict[str, int | bool]:
+    def state_dict(self) -> dict[str, Any]:
         """The cursor and its counts as plain numbers; the moments stay where they are."""
-        return {"moments": self._moments, "steps": self._steps, "open": self._open}
+        return {
+            "moments": self._moments,
+            "steps": self._steps,
+            "open": self._open,
+            "starts": {n: pictures.backgrounds.starts for n, pictures in self._compressed.items()},
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go back to what `state_dict` said; what was written since then is forgotten.
@@ -274,6 +280,8 @@ class Replay:
             )
         if journal is not None:
             journal.undo(moments)
+        for name, starts in state.get("starts", {}).items():
+            self._compressed[name].backgrounds.go_back(int(starts))
         self._take_over(moments, int(state["steps"]), bool(state["open"]))
         self._settled = moments
 

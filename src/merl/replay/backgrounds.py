@@ -1,0 +1,93 @@
+"""What a camera that stands still sees behind everything that moves."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+STAGES = (1, 5, 25)
+"""A background is made after so many episodes' first pictures."""
+
+
+class Backgrounds:
+    """The medians of some episodes' first pictures, in which the arm, each time elsewhere, vanishes.
+
+    What is on the disk is those first pictures, so that a run that goes back to a checkpoint makes
+    the same backgrounds from there on as it would have made.
+
+    Args:
+        size: bytes of a picture.
+        file: keeps the first pictures, one behind the other; without one they are in memory alone.
+    """
+
+    def __init__(self, size: int, file: Path | None) -> None:
+        self._size, self._file = size, file
+        self._starts = _whole(file, size)[: STAGES[-1]]
+        self._made = self._medians()
+        # A run that was begun when the backgrounds themselves were kept stays with those.
+        former = _whole(file and file.with_suffix(".background"), size)
+        self._final = bool(len(former))
+        self._made.extend(former)
+
+    def __len__(self) -> int:
+        """How many there are; number 0, of no picture at all, is black."""
+        return len(self._made)
+
+    def __getitem__(self, number: int) -> NDArray[np.uint8]:
+        """One of them: (size,)."""
+        return self._made[number]
+
+    @property
+    def starts(self) -> int:
+        """How many first pictures they are made of, and the next one will be."""
+        return len(self._starts)
+
+    def begun(self, picture: NDArray[np.uint8]) -> None:
+        """An episode begins so: after some of them the background is known better."""
+        if self._final or self.starts == STAGES[-1]:
+            return
+        row = picture.reshape(1, -1)
+        if self._file is not None:
+            try:
+                _append(self._file, row, self.starts * self._size)
+            except OSError:  # a full disk: the next episode will do
+                return
+        self._starts = np.concatenate([self._starts, row])
+        if self.starts in STAGES:
+            self._made.append(self._median(self.starts))
+
+    def go_back(self, starts: int) -> None:
+        """Forget the first pictures after the first so many, and what was made of them."""
+        if self._final:
+            return
+        self._starts = self._starts[:starts]
+        self._made = self._medians()
+        if self._file is not None and self._file.exists():
+            os.truncate(self._file, self.starts * self._size)
+
+    def _medians(self) -> list[NDArray[np.uint8]]:
+        black = np.zeros(self._size, np.uint8)
+        return [black, *(self._median(stage) for stage in STAGES if stage <= self.starts)]
+
+    def _median(self, starts: int) -> NDArray[np.uint8]:
+        return np.median(self._starts[:starts], axis=0).astype(np.uint8)
+
+
+def _whole(file: Path | None, size: int) -> NDArray[np.uint8]:
+    """The pictures (n, size) that a file holds; one that was cut short is none."""
+    if file is None or not file.exists():
+        return np.empty((0, size), np.uint8)
+    raw = np.fromfile(file, np.uint8)
+    return raw[: len(raw) // size * size].reshape(-1, size)
+
+
+def _append(path: Path, picture: NDArray[np.uint8], at: int) -> None:
+    """Have it on the disk before any picture is kept as a difference from what is made of it."""
+    with path.open("ab") as file:
+        file.truncate(at)  # one that was cut short
+        file.write(picture.tobytes())
+        file.flush()
+        os.fsync(file.fileno())

@@ -35,9 +35,7 @@ def noise(number: int) -> dict[str, np.ndarray]:
 Observe = Callable[[int], dict[str, np.ndarray]]
 
 
-def play(
-    replay: Replay, begin: int, steps: int, length: int = 7, observe: Observe = noise
-) -> None:
+def play(replay: Replay, begin: int, steps: int, length: int = 7, observe: Observe = noise) -> None:
     """Moments `begin`, ...: the picture has the moment's number, the action its step's."""
     for moment in range(begin, begin + steps):
         if moment % length == 0:
@@ -122,7 +120,25 @@ def test_pictures_that_take_more_than_is_reserved_cost_steps_and_are_told(
         play(replay, moment, 7)
         assert_right(everything(replay), moment + 6)
     assert 10 < len(replay) < 30
-    assert caplog.text.count("pictures take more bytes than replay.compress reserves") == 1
+    told = "pictures take more bytes than --replay.compress reserves"
+    assert caplog.text.count(told) == 1
+    assert "a run with --replay.no-compress keeps all" in caplog.text
+
+
+@pytest.mark.parametrize("capacity", [1, 2, 3, 5, 9])
+@pytest.mark.parametrize("frame_stack", [1, 3, 6])
+def test_even_the_smallest_has_a_step_to_learn_from(capacity: int, frame_stack: int) -> None:
+    settings = config(capacity=capacity, batch_size=1, frame_stack=frame_stack)
+    replay = Replay(settings, NOISE, ACTIONS)
+    for moment in range(200):
+        play(replay, moment, 1)
+        if moment:
+            assert 1 <= len(replay) <= capacity
+            batch = everything(replay)
+            newest = moment if moment % 7 else moment - 1
+            assert round(float(batch.action[-1, 0]) * 1000) == newest
+            picture = noise(newest - 1)["image"]
+            np.testing.assert_array_equal(batch.observation["image"][-1, -1], picture)
 
 
 def test_it_is_opened_again_as_it_was(tmp_path: Path) -> None:

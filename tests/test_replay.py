@@ -87,9 +87,12 @@ class Account:
 
     @property
     def slots(self) -> int:
-        return (
-            self.length
-            or self.config.capacity + self.config.capacity // 200 + self.config.frame_stack
+        config = self.config
+        least = config.frame_stack + 2
+        if config.compress:
+            least = 5 * (least + 1)
+        return self.length or max(
+            config.capacity + config.capacity // 200 + config.frame_stack, least
         )
 
     def see(self, episode: int, t: int) -> None:
@@ -625,7 +628,7 @@ def lengthen(run: Run, capacity: int) -> None:
 def test_a_ring_that_has_wrapped_grows_too(tmp_path, capacity, compress):
     for more in range(0, 25, 4):  # wherever it stands
         run = Run(tmp_path / str(more), compress=compress)
-        run.play(9, 9, 0)
+        run.play(9, 9, 9, 0)
         run.play(more)
         lengthen(run, capacity)
         check(run.replay, run.account)
@@ -643,7 +646,7 @@ def test_a_ring_that_has_wrapped_grows_too(tmp_path, capacity, compress):
 def test_it_grows_and_goes_back_to_its_last_checkpoint(tmp_path, compress):
     for more in (0, 2, 5, 9):
         run = Run(tmp_path / str(more), compress=compress)
-        run.play(9, 9, 5)
+        run.play(9, 9, 9, 5)
         run.replay.flush()
         state, moments, lost = run.replay.state_dict(), len(run.account.moments), run.account.lost
         run.replay.settle()
@@ -834,6 +837,27 @@ def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, whe
     check_fits(settings, OBSERVATIONS, ACTIONS, directory=directory, capacity=largest)
 
 
+@pytest.mark.parametrize("count", [1, 3, 7])
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("capacity", [20, 100])
+def test_several_lanes_take_what_was_announced(tmp_path, count, compress, capacity):
+    settings = config(capacity=capacity, batch_size=20, compress=compress)
+    Lanes(settings, OBSERVATIONS, ACTIONS, count=count, directory=tmp_path)
+    taken = sum(file.stat().st_size for file in tmp_path.rglob("*.bin"))
+    assert taken == replay_bytes(settings, OBSERVATIONS, ACTIONS, lanes=count)
+
+
+def test_lanes_that_do_not_fit_together_are_refused(tmp_path, monkeypatch):
+    settings = config(capacity=100)
+    both = replay_bytes(settings, OBSERVATIONS, ACTIONS, lanes=2)
+    monkeypatch.setattr("merl.replay.config.available_memory", lambda: both - 1)
+    with pytest.raises(MerlError, match=r"100 steps .* --replay\.capacity"):
+        Lanes(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr("merl.replay.config.available_memory", lambda: both)
+    Lanes(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
+
+
 def test_where_compression_would_fit_that_is_said(monkeypatch):
     camera = gymnasium.spaces.Box(0, 255, (84, 84, 3), np.uint8)
     spaces = gymnasium.spaces.Dict({"camera": camera})
@@ -889,8 +913,6 @@ def test_a_config_out_of_range_names_field_and_value(name, value):
 def test_a_batch_larger_than_the_replay_is_refused():
     with pytest.raises(MerlError, match=r"batch-size 256 .* of 100 steps"):
         ReplayConfig(capacity=100)
-    with pytest.raises(MerlError, match=r"batch-size 256 .* of 100 steps"):
-        Replay(ReplayConfig(), OBSERVATIONS, ACTIONS, capacity=100)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,9 @@ def _outlook(parts: Parts, what: str, done: int) -> str:
     """What is going to happen, and how long it will take on this machine."""
     config, timing = parts.config, parts.timing
     seconds = timing.seconds(config, done)
-    size = replay_bytes(config.replay, parts.space, parts.action_space, config.capacity)
+    size = replay_bytes(
+        config.replay, parts.space, parts.action_space, config.capacity, config.num_envs
+    )
     tried = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
     seen = not config.own_env and any(is_image(space) for space in parts.space.values())
     pictures = f" ({config.env.renderer} pictures)" if seen else ""

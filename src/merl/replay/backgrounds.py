@@ -13,7 +13,7 @@ STAGES = (1, 5, 25)
 
 
 class Backgrounds:
-    """The medians of some episodes' first pictures, in which the arm, each time elsewhere, vanishes.
+    """Medians of some episodes' first pictures: the arm, each time elsewhere, vanishes in them.
 
     What is on the disk is those first pictures, so that a run that goes back to a checkpoint makes
     the same backgrounds from there on as it would have made.
@@ -73,7 +73,8 @@ class Backgrounds:
         return [black, *(self._median(stage) for stage in STAGES if stage <= self.starts)]
 
     def _median(self, starts: int) -> NDArray[np.uint8]:
-        return np.median(self._starts[:starts], axis=0).astype(np.uint8)
+        median: NDArray[np.floating] = np.median(self._starts[:starts], axis=0)
+        return median.astype(np.uint8)
 
 
 def _whole(file: Path | None, size: int) -> NDArray[np.uint8]:

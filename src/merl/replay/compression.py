@@ -1,8 +1,8 @@
 """Pictures kept compressed, without loss: what differs from the background, by LZ4.
 
 A camera that stands still sees mostly what it saw before. So a picture is kept as its difference
-from a *background* (`backgrounds.py`). Pictures take as many bytes as they take, one behind the other in a ring of
-bytes; where they need more than was reserved, the ring holds fewer steps.
+from a *background* (`backgrounds.py`). Pictures take as many bytes as they take, one behind the
+other in a ring of bytes; where they need more than was reserved, the ring holds fewer steps.
 """
 
 from __future__ import annotations
@@ -17,12 +17,17 @@ from numpy.typing import NDArray
 from merl.replay.backgrounds import Backgrounds
 from merl.replay.places import Places
 
+
 def reserved_bytes(picture_bytes: int) -> int:
     """Bytes that are reserved for a picture, on the average.
 
     A quarter: the arm's pictures at 84x84 take 2.4 KB by `warp` and 3.5 KB by `gl`, of 21.2 KB.
     """
     return picture_bytes // 4 + 64
+
+
+SLOTS_OF_ANY_PICTURE = 5
+"""Whose bytes hold a picture that LZ4 makes no smaller, and a 255th larger."""
 
 
 class CompressedPictures:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gymnasium
 
 from merl.core import MerlError
+from merl.replay.compression import SLOTS_OF_ANY_PICTURE
 from merl.replay.storage import fields_of
 from merl.resources import available_memory, existing_parent, free_disk
 
@@ -30,8 +33,8 @@ class ReplayConfig:
     discount: float = 0.99
     """What a reward is worth one step later (gamma), from 0 to 1."""
     compress: bool = False
-    """Keep pictures compressed, without loss: about a quarter of the space, and sampling takes
-    longer."""
+    """Keep pictures compressed, without loss, in a quarter of the space; sampling takes longer.
+    Pictures of a real camera, which have noise, need more: then fewer steps are kept."""
 
     def __post_init__(self) -> None:
         for name in ("capacity", "batch_size", "n_step", "frame_stack"):
@@ -46,7 +49,11 @@ class ReplayConfig:
                 raise MerlError(f"replay.{flag} is {getattr(self, name)}: give at most {most}")
         if not 0 <= self.discount <= 1:
             raise MerlError(f"replay.discount is {self.discount}: give a number from 0 to 1")
-        check_batch(self.batch_size, self.capacity)
+        if self.batch_size > self.capacity:
+            raise MerlError(
+                f"replay.batch-size {self.batch_size} is larger than the replay of {self.capacity} "
+                f"steps: give at most {self.capacity}, or more steps"
+            )
 
 
 def replay_bytes(
@@ -54,12 +61,21 @@ def replay_bytes(
     observation_space: gymnasium.spaces.Dict,
     action_space: gymnasium.spaces.Box,
     capacity: int | None = None,
+    lanes: int = 1,
 ) -> int:
-    """Bytes that a replay takes, on disk or in memory; `capacity` counts steps."""
+    """Bytes that a replay takes, on disk or in memory.
+
+    Args:
+        config: what is kept.
+        observation_space: see `Replay`.
+        action_space: see `Replay`.
+        capacity: steps, in place of the config's.
+        lanes: rings that share them.
+    """
     steps = config.capacity if capacity is None else capacity
     fields = fields_of(observation_space, action_space, config.compress)
     slot = sum(field.bytes for field in fields.values())
-    return slot * slots_for(steps, config.frame_stack)
+    return slot * lanes * slots_for(config, lane_capacity(steps, lanes))
 
 
 def check_fits(
@@ -69,64 +85,73 @@ def check_fits(
     *,
     directory: Path | None = None,
     capacity: int | None = None,
+    lanes: int = 1,
 ) -> None:
     """Refuse a replay that the disk or the memory cannot hold, before anything is created.
 
     Even a replay on disk has to fit into memory: one that does not reads the disk for every sample.
 
+    Args:
+        config: what is kept.
+        observation_space: see `Replay`.
+        action_space: see `Replay`.
+        directory: where it is to lie, or lies already; in memory, if not given.
+        capacity: steps, in place of the config's.
+        lanes: rings that share them.
+
     Raises:
-        MerlError: it does not fit: the message names the largest capacity that would. Or it is
-            smaller than one batch.
+        MerlError: it does not fit: the message names the largest capacity that would.
     """
     steps = config.capacity if capacity is None else capacity
-    check_batch(config.batch_size, steps)
+
+    def bytes_of(config: ReplayConfig, steps: int) -> int:
+        return replay_bytes(config, observation_space, action_space, steps, lanes)
+
     room = {"of memory are available": available_memory()}
     if directory is not None:
         where = existing_parent(directory)
-        ours = sum(file.stat().st_size for file in directory.glob("*.bin"))  # if it is opened again
+        ours = sum(
+            file.stat().st_size for file in directory.rglob("*.bin")
+        )  # if it is opened again
         room[f"of disk are free in {where}"] = free_disk(where) + ours
     what, least = min(room.items(), key=lambda item: item[1])
-    need = replay_bytes(config, observation_space, action_space, steps)
-    if need > least:
-        raise _too_large(config, observation_space, action_space, steps, what, least)
+    if bytes_of(config, steps) > least:
+        raise _too_large(config, steps, bytes_of, what, least)
 
 
-def slots_for(capacity: int, frame_stack: int) -> int:
+def lane_capacity(steps: int, lanes: int) -> int:
+    """Steps of one of so many rings that share them."""
+    return math.ceil(steps / lanes)
+
+
+def slots_for(config: ReplayConfig, capacity: int) -> int:
     """Moments that hold `capacity` steps of episodes of two hundred steps or more.
 
     An episode has one moment more than steps, and the oldest step needs its whole stack. Episodes
-    that are shorter fill the slots before the capacity is reached.
+    that are shorter fill the slots before the capacity is reached. There is always room for one
+    step and the beginning of the next episode, even of pictures that no compression makes smaller.
     """
-    return capacity + capacity // 200 + frame_stack
-
-
-def check_batch(batch_size: int, capacity: int) -> None:
-    """Raise MerlError for a batch that the replay could never fill with different steps."""
-    if batch_size > capacity:
-        raise MerlError(
-            f"replay.batch-size {batch_size} is larger than the replay of {capacity} steps: "
-            f"give at most {capacity}, or more steps"
-        )
+    least = config.frame_stack + 2
+    if config.compress:
+        least = SLOTS_OF_ANY_PICTURE * (least + 1)  # none reaches across the end of the bytes
+    return max(capacity + capacity // 200 + config.frame_stack, least)
 
 
 def _too_large(
     config: ReplayConfig,
-    observation_space: gymnasium.spaces.Dict,
-    action_space: gymnasium.spaces.Box,
     capacity: int,
+    bytes_of: Callable[[ReplayConfig, int], int],
     what: str,
     room: int,
 ) -> MerlError:
     """The error that names the largest capacity for which there is room."""
-    need = replay_bytes(config, observation_space, action_space, capacity)
+    need = bytes_of(config, capacity)
     low, high = 0, capacity  # low fits, high does not
     while high - low > 1:
         middle = (low + high) // 2
-        fits = replay_bytes(config, observation_space, action_space, middle) <= room
-        low, high = (middle, high) if fits else (low, middle)
+        low, high = (middle, high) if bytes_of(config, middle) <= room else (low, middle)
     way_out = f"--replay.capacity {low} would fit" if low else "free some"
-    compressed = replace(config, compress=True)
-    small = replay_bytes(compressed, observation_space, action_space, capacity)
+    small = bytes_of(replace(config, compress=True), capacity)
     if small < need and small <= room:
         way_out = f"--replay.compress brings it to {small / 1e9:.3g} GB, or {way_out}"
     return MerlError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from merl.core import Batch, Copies, Copy
-from merl.replay.config import ReplayConfig
+from merl.replay.config import ReplayConfig, check_fits, lane_capacity
 from merl.replay.ring import Replay
 
 
@@ -48,14 +47,21 @@ class Lanes:
         capacity: int | None = None,
     ) -> None:
         whole = config.capacity if capacity is None else capacity
-        each = max(math.ceil(whole / count), config.batch_size)
+        check_fits(
+            config,
+            observation_space,
+            action_space,
+            directory=directory,
+            capacity=whole,
+            lanes=count,
+        )
         self.lanes = [
             Replay(
                 config,
                 observation_space,
                 action_space,
                 directory=directory if directory is None or count == 1 else directory / str(index),
-                capacity=each,
+                capacity=lane_capacity(whole, count),
             )
             for index in range(count)
         ]

@@ -91,7 +91,7 @@ class Replay:
             config, observation_space, action_space, directory=directory, capacity=self.capacity
         )
         fields = fields_of(observation_space, action_space, config.compress)
-        slots = slots_for(self.capacity, config.frame_stack)
+        slots = slots_for(config, self.capacity)
         self._files: dict[str, mmap.mmap] = {}
         arrays: dict[str, NDArray[Any]]
         if directory is None:
@@ -340,8 +340,8 @@ class Replay:
         if not self._told:
             self._told = True
             _LOG.warning(
-                "pictures take more bytes than replay.compress reserves: the replay keeps about "
-                "%s of its %s steps",
+                "pictures take more bytes than --replay.compress reserves: the replay keeps about "
+                "%s of its %s steps; a run with --replay.no-compress keeps all",
                 f"{len(self):,}",
                 f"{self.capacity:,}",
             )

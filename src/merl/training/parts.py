@@ -103,6 +103,7 @@ class Parts:
                     actions,
                     directory=run_path(config),
                     capacity=config.capacity,
+                    lanes=config.num_envs,
                 )
             size = max(config.env.render_size, MIN_SIDE)
             eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -233,6 +234,29 @@ def test_what_is_no_step_is_told(step: Any, says: str) -> None:
     env.reset()
     with pytest.raises(EnvironmentFailed, match=says):
         env.step(np.zeros(2, np.float32))
+
+
+def interrupted(observation: Any) -> Any:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("handler", "raised"),
+    [
+        (signal.default_int_handler, KeyboardInterrupt),  # the user's Ctrl-C may have raised it
+        (signal.SIG_IGN, EnvironmentFailed),  # as in a worker's process
+        (lambda *_: None, EnvironmentFailed),  # as in a run
+    ],
+)
+def test_a_keyboard_interrupt_of_its_own_is_told(handler: Any, raised: type[BaseException]) -> None:
+    env = adapt(Misgiving(step=interrupted))
+    env.reset()
+    former = signal.signal(signal.SIGINT, handler)
+    try:
+        with pytest.raises(raised, match="step raised KeyboardInterrupt|^$"):
+            env.step(np.zeros(2, np.float32))
+    finally:
+        signal.signal(signal.SIGINT, former)
 
 
 def test_what_is_usual_is_taken() -> None:

@@ -67,6 +67,34 @@ def test_updates_per_step_are_held_exactly(hundredths: int) -> None:
     assert moment.step == 60
 
 
+@pytest.mark.parametrize("synchronous", [True, False])
+@pytest.mark.parametrize("step", [30, 60])
+def test_a_stop_waits_for_no_more_than_one_update(step: int, synchronous: bool) -> None:
+    """And what was left of a step is made up for when the run goes on."""
+    settings = dataclasses.replace(CONFIG, updates_per_step=7.0, synchronous=synchronous)
+    parts = Parts(settings)
+    stop = False
+    update = parts.update
+
+    def stopping() -> dict[str, torch.Tensor]:
+        nonlocal stop
+        stop = stop or (parts.progress.step == step and parts.progress.updates % 7 == 2)
+        return update()
+
+    arguments = parts.stage, parts.agent, stopping, parts.progress, parts.randomness, settings
+    made = 0
+    for moment in train(*arguments, lambda: stop):
+        made = moment.updates
+        if stop:
+            break
+    assert moment.step == step if synchronous or step == 60 else step + 1
+    assert made == 7 * (step - 21) + 3
+    parts.update = update
+    *_, last = [*parts.moments()] or [moment]
+    assert last.step == 60
+    assert parts.progress.updates == 7 * 40
+
+
 def test_a_ratio_is_taken_as_it_is_written() -> None:
     """600 times 0.57 is 342; of floats it is a little less."""
     for hundredths in range(300):

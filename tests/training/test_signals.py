@@ -66,3 +66,18 @@ def test_a_second_signal_ends_at_once(number: int) -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
     assert done.returncode == 128 + number
     assert done.stdout == b""
+
+
+def test_who_has_to_wait_is_told_for_what() -> None:
+    program = (
+        "import os, signal, time; from merl.training import signals\n"
+        "signals.PATIENCE = 0.2\n"
+        "with signals.Interrupt().listening():\n"
+        "    os.kill(os.getpid(), signal.SIGINT); time.sleep(%s)\n"
+        "time.sleep(0.5)"
+    )
+    for seconds, told in ((1.0, 1), (0.0, 0)):
+        done = subprocess.run(
+            [sys.executable, "-c", program % seconds], capture_output=True, check=True, text=True
+        )
+        assert done.stderr.count("a second signal (Ctrl-C) stops at once") == told

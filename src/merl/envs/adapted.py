@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sysconfig
 import traceback
 import warnings
@@ -178,8 +179,15 @@ def failing(what: str) -> Iterator[None]:
         yield
     except MerlError:
         raise
-    except (Exception, SystemExit) as error:  # drivers do call sys.exit
+    except (Exception, SystemExit, KeyboardInterrupt) as error:  # drivers do call sys.exit
+        if isinstance(error, KeyboardInterrupt) and _ctrl_c_raises():
+            raise
         raise EnvironmentFailed(f"the environment's {what} raised {in_one_line(error)}") from error
+
+
+def _ctrl_c_raises() -> bool:
+    """Whether a KeyboardInterrupt is the user's wish; elsewhere it is the environment's own."""
+    return signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def in_one_line(error: BaseException) -> str:

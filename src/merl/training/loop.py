@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,7 @@ def train(
     progress: Progress,
     randomness: Randomness,
     config: TrainConfig,
+    is_to_stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Moment]:
     """Act and learn until `config.steps`; yields after each step of the environments.
 
@@ -116,12 +118,17 @@ def train(
         progress: moved on as the run goes.
         randomness: the run's random streams.
         config: steps, seed steps, random steps, updates per step, batch size.
+        is_to_stop: whether the updates that are due are to be left for when the run goes on.
 
     Raises:
         NotFinite: an observation or a reward is no number; the replay does not take it in.
     """
     if progress.episodes == 0:
         stage.seed(randomness, progress)
+    learn = partial(_learn, update, progress, config, is_to_stop)
+    if config.synchronous or progress.step >= config.steps:
+        agent.step = progress.step
+        learn()  # what was left when it was stopped
     while progress.step < config.steps:
         agent.step = progress.step
         learning: dict[str, Tensor] = {}
@@ -132,17 +139,17 @@ def train(
             # learn before its actions are waited for, lest it stand idle until they have arrived.
             told = actions.under_way and not config.synchronous
             if told:
-                learning = _learn(update, progress, config)
+                learning = learn()
             stage.act(actions.wait().numpy())
             if not (told or config.synchronous):
-                learning = _learn(update, progress, config)
+                learning = learn()
             ended = stage.remember(progress, config.action_repeat)
         except Lost as lost:
             stage.broken = True
             yield Moment(progress.step, progress.updates, learning, lost=str(lost))
             continue
         if config.synchronous or progress.step >= config.steps:
-            learning = _learn(update, progress, config) or learning
+            learning = learn() or learning
         progress.episodes += len(ended)
         yield Moment(progress.step, progress.updates, learning, ended)
 
@@ -238,11 +245,13 @@ def updates_due(steps: int, updates_per_step: float) -> int:
     return int(steps * Fraction(str(updates_per_step)))
 
 
-def _learn(update: Update, progress: Progress, config: TrainConfig) -> dict[str, Tensor]:
+def _learn(
+    update: Update, progress: Progress, config: TrainConfig, is_to_stop: Callable[[], bool]
+) -> dict[str, Tensor]:
     """The updates that are due: after t steps, (t - seed_steps) updates_per_step in all."""
     due = updates_due(progress.step - config.seed_steps, config.updates_per_step)
     metrics: dict[str, Tensor] = {}
-    while progress.updates < due:
+    while progress.updates < due and not is_to_stop():
         metrics = update()
         progress.updates += 1
     return metrics

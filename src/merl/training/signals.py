@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Timer
 from types import FrameType
 
 SHOW_CURSOR = "\x1b[?25h"
@@ -16,6 +17,10 @@ _HEARD = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 _APART = 0.1
 """Seconds from which on a second signal is one of its own: `timeout` and batch systems may send the
 same one twice, to the process and to its group."""
+
+
+PATIENCE = 3.0
+"""Seconds after which who has asked to stop is told what is waited for."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -41,6 +46,7 @@ class Interrupt:
     number: int | None = None
     _at: float = 0.0
     _raises: bool = False
+    _telling: Timer | None = None
 
     @contextmanager
     def listening(self) -> Iterator[Interrupt]:
@@ -55,6 +61,8 @@ class Interrupt:
         finally:
             for number, handler in former.items():
                 signal.signal(number, handler)
+            if self._telling is not None:
+                self._telling.cancel()
 
     @contextmanager
     def raising(self) -> Iterator[None]:
@@ -70,8 +78,21 @@ class Interrupt:
             self.number, self._at = number, time.monotonic()
             if self._raises:
                 raise Stopped(number)
+            self._telling = Timer(PATIENCE, _tell)
+            self._telling.daemon = True
+            self._telling.start()
         # A closed terminal sends SIGHUP twice, and saving takes a moment.
         elif number != signal.SIGHUP and time.monotonic() - self._at > _APART:
             if sys.stdout.isatty():  # the live view hides it
                 os.write(sys.stdout.fileno(), SHOW_CURSOR.encode())
             os._exit(128 + number)
+
+
+def _tell() -> None:
+    """A step of the environment, an update or saving takes its time, or will never end."""
+    print(
+        "merl: stopping once this step is done and saved; a second signal (Ctrl-C) stops at once, "
+        "back to the last checkpoint",
+        file=sys.stderr,
+        flush=True,
+    )

@@ -132,9 +132,10 @@ class Stretch:
             self._save()  # from here on there is something to go on from
         self.clock.mark(progress)
         self._ended = progress.step
-        for count, moment in enumerate(
-            train(stage, parts.agent, update, progress, parts.randomness, self.config)
-        ):
+        moments = train(
+            stage, parts.agent, update, progress, parts.randomness, self.config, self._is_to_stop
+        )
+        for count, moment in enumerate(moments):
             if count == 0 and not moment.lost and None in self._environment_states():
                 self.view.warn(
                     "a resumed run will meet other episodes than this one would: the environment "

@@ -283,7 +283,10 @@ BAD = {
     "train reach_duplo --agent.tau nan": "(0, 1], not nan",
     "train reach_duplo --agent.latent-dim 3": "leaves 1 for each of 2 modalities",
     "train reach_duplo --observations state": "--agent.vectors state",
-    "train reach_duplo --updates-per-step inf": "updates-per-step must be at least 0, not inf",
+    "train reach_duplo --updates-per-step inf": "must be finite and at least 0, not inf",
+    "train reach_duplo --num-envs 0": "num-envs must be at least 1 and at most 1,024, not 0",
+    "bench update --json nowhere/bench.json": "nowhere/bench.json cannot be written: No such file",
+    "bench update --json .": ". cannot be written: Is a directory",
     "train reach_duplo --agent.vectors joints": "the environment gives ['proprio', 'state']",
     "train reach_duplo --image-size 8": "16",
     "train reach_duplo --renderer wrap": "'gl', 'warp'",
@@ -318,6 +321,21 @@ def test_what_may_be_left_out_is_not_offered_as_none(capsys: pytest.CaptureFixtu
     error = capsys.readouterr().err
     assert "'warp'" in error
     assert "None" not in error
+
+
+def test_where_updates_cannot_be_compiled_the_run_says_so_and_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("no compiler\n  at all")
+
+    monkeypatch.setattr(torch, "compile", fail)
+    monkeypatch.setattr("merl.training.timing.worth_compiling", lambda *_: True)  # as on a GPU
+    line = "train Pendulum-v1 --agent ddpg --preset smoke --steps 400 --eval.video none --run-dir"
+    assert main([*line.split(), str(tmp_path / "run")]) == 0
+    told = capsys.readouterr()
+    assert "updates are not compiled, which fails here: no compiler\n" in told.out
+    assert "Traceback" not in told.err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

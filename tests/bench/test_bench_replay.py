@@ -2,9 +2,11 @@
 
 import json
 
+import pytest
 from rich.console import Console
 
 from merl.bench import replay as bench
+from merl.core import MerlError
 
 
 def test_both_sides_are_timed():
@@ -19,3 +21,9 @@ def test_both_sides_are_timed():
         assert 0 < result["sample_ms"][side]["median"] <= result["ready_ms"][side]["high"]
         assert result["gigabytes"][side] <= bench.BARS_GB[side]
     assert result["picture_bytes"][bench.COMPRESSED] < result["picture_bytes"][bench.RAW] / 4
+
+
+def test_where_temporary_files_have_no_room_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "free_disk", lambda _: 200_000_000)
+    with pytest.raises(MerlError, match=r"takes 0\.27 GB .* name a larger folder in TMPDIR"):
+        bench.run(repeats=1)

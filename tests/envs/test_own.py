@@ -253,7 +253,7 @@ def test_a_keyboard_interrupt_of_its_own_is_told(handler: Any, raised: type[Base
     env.reset()
     former = signal.signal(signal.SIGINT, handler)
     try:
-        with pytest.raises(raised, match="step raised KeyboardInterrupt|^$"):
+        with pytest.raises(raised, match=r"step raised KeyboardInterrupt|^$"):
             env.step(np.zeros(2, np.float32))
     finally:
         signal.signal(signal.SIGINT, former)

@@ -223,6 +223,14 @@ def test_who_cannot_be_resumed_exactly_is_told(
     assert told == (which == "of_its_own")
 
 
+def test_of_several_environments_the_one_is_named_whose_reward_is_no_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", "broken", "--num-envs", "3") == 3
+    error = capsys.readouterr().err
+    assert "the environment's reward is nan at step 74 of environment 1" in error
+
+
 def test_an_error_in_another_process_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -86,6 +86,22 @@ class Failing(Plain):
         return super().step(action)
 
 
+class Broken(Plain):
+    """The second one's reward is no number at its 25th step."""
+
+    def __init__(self) -> None:
+        self.all, self.is_second = 0, multiprocessing.current_process().name.endswith("-1")
+
+    def step(self, action: Any) -> Any:
+        self.all += 1
+        seen, reward, *rest = super().step(action)
+        return (seen, np.nan if self.is_second and self.all == 25 else reward, *rest)
+
+
+def broken() -> Plain:
+    return Broken()
+
+
 class Stillborn(Plain):
     """Dies at its first reset, if it has a process of its own."""
 

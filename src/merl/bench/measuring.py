@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 
 import torch
 
+import merl
 from merl.resources import keep_freed_memory
-from merl.training.machine import machine, package_versions
+from merl.training.machine import commit, machine, package_versions
 
 Work = Callable[[], object]
 
@@ -71,8 +72,10 @@ def shown(spread: dict[str, float]) -> str:
 def circumstances() -> dict[str, Any]:
     """Under which a figure was measured."""
     return {
+        "merl": merl.__version__,
+        "commit": commit(),
         "machine": machine(),
-        "versions": package_versions(),
+        "versions": package_versions("stable-baselines3"),
         "threads": torch.get_num_threads(),
         "load": os.getloadavg()[0],
     }

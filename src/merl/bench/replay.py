@@ -17,10 +17,11 @@ from rich.table import Table
 from torch import Tensor
 
 from merl.bench.measuring import Work, circumstances, seconds, shown, spread, take_turns
-from merl.core import Copies, Transition
+from merl.core import Copies, MerlError, Transition
 from merl.envs import make_env
 from merl.networks.augmentation import Crop, draw_shifts, to_input
 from merl.replay import Replay, ReplayConfig, replay_bytes
+from merl.resources import free_disk
 
 EPISODE, PAD, MILLION = 250, 4, 1_000_000
 RAW, COMPRESSED = "raw", "compressed (--replay.compress)"
@@ -82,6 +83,7 @@ def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
         for side in BARS_GB
     }
     with tempfile.TemporaryDirectory() as folder:
+        _check_room(Path(folder), space, actions, steps)
         rings: dict[str, Replay] = {}
         writing, sizes = {}, {}
         for side in BARS_MS:
@@ -109,6 +111,20 @@ def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
         "picture_bytes": sizes,
         "gigabytes": million,
     }
+
+
+def _check_room(folder: Path, space: spaces.Dict, actions: spaces.Box, steps: int) -> None:
+    """Raise MerlError unless both rings have room where temporary files lie."""
+    need = sum(
+        replay_bytes(ReplayConfig(compress=side == COMPRESSED), space, actions, steps)
+        for side in BARS_MS
+    )
+    free = free_disk(folder)
+    if need > free:
+        raise MerlError(
+            f"what is measured takes {need / 1e9:.3g} GB in {folder.parent}, where {free / 1e9:.3g}"
+            " GB are free: name a larger folder in TMPDIR"
+        )
 
 
 def _pictures() -> tuple[spaces.Dict, spaces.Box, list[dict[str, Any]]]:

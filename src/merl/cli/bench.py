@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from merl.bench import BENCHES
-from merl.cli.parsing import parse, write_json
+from merl.cli.parsing import check_writable, parse, write_json
 from merl.core import MerlError, meant
 
 
@@ -31,6 +31,7 @@ def bench(args: list[str]) -> int:
     repeats, output = parse(command, f"merl bench {args[0]}", args[1:])
     if repeats < 1:
         raise MerlError(f"--repeats must be at least 1, not {repeats}")
+    check_writable(output)
     run, show = BENCHES[args[0]]
     result = run(repeats=repeats)
     Console().print(show(result))

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from merl.cli.parsing import parse, write_json
+from merl.cli.parsing import check_writable, parse, write_json
 from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
@@ -51,6 +51,7 @@ class EvaluateOptions:
 def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
     options = parse(EvaluateOptions, "merl evaluate", args)
+    check_writable(options.json)
     console = Console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     # As the run had it: several threads wait for each other where the machine does other work, too.

@@ -95,6 +95,23 @@ def program() -> str:
     return os.path.relpath(called)
 
 
+def check_writable(path: Path | None) -> None:
+    """See to it, before long work, that a file can be written that the user asked for.
+
+    Raises:
+        MerlError: it cannot.
+    """
+    if path is None:
+        return
+    there = path.exists()
+    try:
+        path.open("a").close()
+        if not there:
+            path.unlink()
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write a file that the user asked for.
 
@@ -104,4 +121,10 @@ def write_json(path: Path, value: Any) -> None:
     try:
         path.write_text(json.dumps(value, indent=1) + "\n")
     except OSError as error:
-        raise MerlError(f"{path} cannot be written: {error.strerror}") from None
+        raise _unwritable(path, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> MerlError:
+    return MerlError(
+        f"{path} cannot be written: {error.strerror}: name a file in a folder that is there"
+    )

@@ -111,11 +111,12 @@ class TrainConfig:
                 f"agent {self.agent_name!r} is made from a {kind.__name__}, not from a "
                 f"{type(self.agent).__name__}"
             )
+        most = {"num_envs": MOST_ENVS}
         for name in ("steps", "keep", "action_repeat", "num_envs"):
-            if not 1 <= getattr(self, name) <= MOST_STEPS:
+            if not 1 <= getattr(self, name) <= most.get(name, MOST_STEPS):
                 raise MerlError(
-                    f"{name.replace('_', '-')} must be at least 1 and at most {MOST_STEPS:,}, "
-                    f"not {getattr(self, name)}"
+                    f"{name.replace('_', '-')} must be at least 1 and at most "
+                    f"{most.get(name, MOST_STEPS):,}, not {getattr(self, name)}"
                 )
         for name in ("random_steps", "seed_steps", "seed", "worker_restarts"):
             if getattr(self, name) < 0:
@@ -127,14 +128,12 @@ class TrainConfig:
             raise MerlError(
                 f"worker-timeout must be above 0 and at most 1e6 seconds, not {self.worker_timeout}"
             )
-        if self.num_envs > MOST_ENVS:
-            raise MerlError(f"num-envs must be at most {MOST_ENVS}, not {self.num_envs}")
         if self.threads is not None and self.threads < 1:
             raise MerlError(f"threads must be at least 1, not {self.threads}")
         for name in ("updates_per_step", "save_every"):
             if not 0 <= getattr(self, name) < math.inf:
                 flag = name.replace("_", "-")
-                raise MerlError(f"{flag} must be at least 0, not {getattr(self, name)}")
+                raise MerlError(f"{flag} must be finite and at least 0, not {getattr(self, name)}")
         if self.replay.batch_size > self.capacity:
             raise MerlError(
                 f"replay.batch-size {self.replay.batch_size} is more than the {self.capacity} "

@@ -200,7 +200,7 @@ class Stage:
         if not starting:
             return
         for index, observation in self.environments.reset(starting).items():
-            check_moment(observation, 0.0, progress.step)
+            check_moment(observation, 0.0, progress.step, self._where(index))
             self.replay.lanes[index].begin(observation)
             self.stacks[index].reset(observation)
             self._episodes[index] = Episode()
@@ -215,7 +215,8 @@ class Stage:
         assert self._actions is not None
         ended = []
         for index, step in enumerate(self.environments.receive()):
-            check_moment(step.observation, step.reward, progress.step + repeat)
+            reached = progress.step + repeat
+            check_moment(step.observation, step.reward, reached, self._where(index))
             over = bool(step.terminated or step.truncated)
             discount = 0.0 if step.terminated else 1.0
             self.replay.lanes[index].add(
@@ -227,6 +228,10 @@ class Stage:
             if over:
                 ended.append(self._episodes.pop(index))
         return tuple(ended)
+
+    def _where(self, index: int) -> str:
+        """Which environment, where there are several; the first is number 0."""
+        return f"of environment {index}" if self.count > 1 else ""
 
 
 def _actions(

@@ -13,13 +13,22 @@ import torch
 
 import merl
 
-PACKAGES = ("torch", "numpy", "gymnasium", "dm_control", "mujoco", "mujoco-warp", "warp-lang")
+PACKAGES = (
+    "torch",
+    "numpy",
+    "gymnasium",
+    "dm_control",
+    "mujoco",
+    "mujoco-warp",
+    "warp-lang",
+    "lz4",
+)
 
 
-def package_versions() -> dict[str, str]:
-    """The versions of what a result depends on."""
+def package_versions(*others: str) -> dict[str, str]:
+    """The versions of what a result depends on, and of other packages that it may depend on."""
     found = {"python": platform.python_version()}
-    for name in PACKAGES:
+    for name in (*PACKAGES, *others):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

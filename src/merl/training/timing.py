@@ -32,6 +32,9 @@ MEASURED_STEPS = 25
 THREADS_PAY = 1.3
 """How many times faster several threads must be than one to be chosen. They wait for each other at
 every operation: once another process takes a core, they can become ten times slower than one."""
+BF16_PAYS = 1.1
+"""How many times faster than in fp32 an update must be in bf16 for that to be chosen: where the two
+are alike, the same command is to give the same run."""
 WORTH_COMPILING = 1800.0
 """Seconds that a run must take for a compiled update to be tried, which takes a minute or two."""
 
@@ -47,6 +50,12 @@ class Arithmetic:
     def __str__(self) -> str:
         how = f"{self.precision}, compiled," if self.compiled else self.precision
         return f"{how} on {self.threads} thread{'s' * (self.threads > 1)}"
+
+    @property
+    def must_gain(self) -> float:
+        """By which factor it must be faster than strict fp32 on one thread to be chosen."""
+        precision = BF16_PAYS if self.precision == "bf16" else 1.0
+        return precision * (THREADS_PAY if self.threads > 1 else 1.0)
 
     def decided(self, config: AgentConfig) -> AgentConfig:
         """A config with what it may have left open."""
@@ -73,12 +82,8 @@ class Timing:
 
     @property
     def best(self) -> Arithmetic:
-        """The fastest way to compute updates; more threads only where they clearly pay."""
-
-        def cost(arithmetic: Arithmetic) -> float:
-            return self.update[arithmetic] * (THREADS_PAY if arithmetic.threads > 1 else 1.0)
-
-        return min(self.update, key=cost)
+        """The fastest way to compute updates; bf16 and more threads only where they clearly pay."""
+        return min(self.update, key=lambda how: self.update[how] * how.must_gain)
 
     def seconds(self, config: TrainConfig, done: int = 0) -> float:
         """The time that a run will take from step `done` on, evaluation included."""
@@ -130,7 +135,7 @@ def measure(
     compiled = config.agent.torch_compile == "yes"
     for precision in precisions:
         agent = attempt(Arithmetic(precision, threads, compiled))
-    fastest = min(update, key=lambda arithmetic: update[arithmetic])
+    fastest = Timing(update, 0.0).best
     if config.threads is None and cores > threads:
         attempt(dataclasses.replace(fastest, threads=cores))
     use_threads(threads)

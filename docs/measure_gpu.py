@@ -76,7 +76,7 @@ def main(
         repeats: turns of each side.
     """
     out.mkdir(parents=True, exist_ok=True)
-    console = Console()
+    console = Console(markup=False)
     console.print(circumstances())
     for name, part in {
         "launches": lambda: launches(agent),
@@ -90,7 +90,7 @@ def main(
         try:
             found = part()
         except Exception as error:
-            console.print(f"{name} failed: {type(error).__name__}: {error}", markup=False)
+            console.print(f"{name} failed: {type(error).__name__}: {error}")
             continue
         (out / f"{name}.json").write_text(json.dumps(found, indent=1))
 
@@ -98,7 +98,7 @@ def main(
 def shown(bench: Any, **asked: Any) -> Any:
     """What a bench found; printed, too."""
     result = bench.run(**asked)
-    Console().print(bench.table(result))
+    Console(markup=False).print(bench.table(result))
     return result
 
 

@@ -29,7 +29,7 @@ MERL = [sys.executable, "-m", "merl.cli"]
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole `smoke` run, trained once."""
-    folder = tmp_path_factory.mktemp("runs") / "a run, größer"
+    folder = tmp_path_factory.mktemp("runs") / "a run, [größer]"
     arguments = ["train", "reach_duplo", "--preset", "smoke", "--run-dir", str(folder)]
     command = [*MERL, *arguments, "--threads", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
@@ -37,6 +37,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.stdout.startswith("preset smoke (as asked for")
     for said in ("take about", "MB for 1,000 steps", "random actions", "best known", "too early"):
         assert said in done.stdout
+    assert f"go on with: merl resume '{folder}' --steps" in done.stdout
+    assert f"learning curve: {folder}/curve.png" in done.stdout
     assert "Traceback" not in done.stderr
     return folder
 

@@ -9,7 +9,7 @@ from merl.core import MerlError
 
 
 def text_of(result):
-    console = Console(width=200)
+    console = Console(width=200, markup=False)
     with console.capture() as capture:
         console.print(bench.table(result))
     return capture.get()

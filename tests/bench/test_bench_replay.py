@@ -12,7 +12,7 @@ from merl.core import MerlError
 def test_both_sides_are_timed():
     result = bench.run(repeats=1, steps=500, batch_size=4)
     assert json.loads(json.dumps(result)) == result
-    console = Console(width=300)
+    console = Console(width=300, markup=False)
     with console.capture() as capture:
         console.print(bench.table(result))
     shown = capture.get()

@@ -34,7 +34,7 @@ def bench(args: list[str]) -> int:
     check_writable(output)
     run, show = BENCHES[args[0]]
     result = run(repeats=repeats)
-    Console().print(show(result))
+    Console(markup=False).print(show(result))
     if output is not None:
         write_json(output, result)
     return 0

@@ -52,7 +52,7 @@ def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
     options = parse(EvaluateOptions, "merl evaluate", args)
     check_writable(options.json)
-    console = Console()
+    console = Console(markup=False)
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     # As the run had it: several threads wait for each other where the machine does other work, too.
     use_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))

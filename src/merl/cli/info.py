@@ -29,7 +29,7 @@ def info(args: list[str]) -> int:
         """Show what this machine offers, measured here (takes half a minute)."""
 
     parse(command, "merl info", args)
-    console = Console()
+    console = Console(markup=False)
     table = Table(show_header=False, box=None, padding=(0, 2))
     with console.status("measuring"):
         for name, value in _rows():

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import sys
 from collections.abc import Callable
@@ -93,6 +94,11 @@ def program() -> str:
     if found or called.name != "merl":
         return "merl"
     return os.path.relpath(called)
+
+
+def resume_line(folder: Path) -> str:
+    """What to type to go on with a run."""
+    return f"{program()} resume {shlex.quote(str(folder))}"
 
 
 def check_writable(path: Path | None) -> None:

@@ -9,7 +9,7 @@ from datetime import timedelta
 from rich.console import Console
 from rich.filesize import decimal
 
-from merl.cli.parsing import program
+from merl.cli.parsing import resume_line
 from merl.cli.summary import summarize
 from merl.core import MerlError, is_image
 from merl.replay import replay_bytes
@@ -73,7 +73,7 @@ def go_on(run: Run, asked: TrainConfig) -> int:
 def _train(
     config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint | None] | None = None
 ) -> int:
-    console = Console()
+    console = Console(markup=False)
     with ExitStack() as stack:
         try:
             with console.status("building the scene and timing this machine"):
@@ -97,7 +97,7 @@ def _train(
             "and saved: go on" if outcome.saved else "and not saved: go on from the last checkpoint"
         )
         console.print(f"{stopped} {how} with")
-        console.print(f"    {program()} resume {folder}", highlight=False, soft_wrap=True)
+        console.print(f"    {resume_line(folder)}", highlight=False, soft_wrap=True)
         return 128 + outcome.signal
     try:
         summarize(outcome, console)

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from merl.cli.parsing import program
+from merl.cli.parsing import resume_line
 from merl.core import MerlError
 from merl.report.figures import learning_curve
 from merl.report.references import Reference, references
@@ -126,5 +126,5 @@ def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> 
 def _way_on(outcome: Outcome) -> str:
     run, step = outcome.run, outcome.progress.step
     if step < run.config.steps:
-        return f"go on with: {program()} resume {run.path}"
-    return f"go on with: {program()} resume {run.path} --steps {2 * run.config.steps}"
+        return f"go on with: {resume_line(run.path)}"
+    return f"go on with: {resume_line(run.path)} --steps {2 * run.config.steps}"

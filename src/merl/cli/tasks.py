@@ -35,7 +35,7 @@ def tasks(args: list[str]) -> int:
         return pictures
 
     folder = parse(command, "merl tasks", args)
-    console = Console()
+    console = Console(markup=False)
     for name in TASKS:
         picture = _picture(name)
         console.print(_entry(name, picture, console), highlight=False)

@@ -16,6 +16,7 @@ import dataclasses
 import json
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -90,6 +91,7 @@ def main(
         try:
             found = part()
         except Exception as error:
+            traceback.print_exc()
             console.print(f"{name} failed: {type(error).__name__}: {error}")
             continue
         (out / f"{name}.json").write_text(json.dumps(found, indent=1))

@@ -32,7 +32,7 @@ def mean_return(task: str, agent: str, seed: int, folder: Path, steps: int | Non
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("agent", "seed"), product(("ddpg", "sac"), range(3)))
+@pytest.mark.parametrize(("agent", "seed"), [*product(("ddpg", "sac"), range(3))])
 def test_pendulum_is_swung_up(agent: str, seed: int, tmp_path: Path) -> None:
     assert mean_return(PENDULUM, agent, seed, tmp_path) > -250
 

@@ -28,6 +28,7 @@ from torch import Tensor
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
+from merl.networks import augmentation, representation
 from merl.networks.critic import TwinCritic
 
 SIZES = {"conv_channels": 8, "hidden_dim": 32, "precision": "fp32"}
@@ -207,11 +208,21 @@ def test_as_a_gpu_computes_the_twins(case: Case, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("at_once", [False, True])
-def test_compiled(at_once: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("as_on_a_gpu", [False, True])
+def test_compiled(as_on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes a minute, and a C++ compiler."""
     case = replace(CASES[0], config=replace(SMALL, torch_compile="yes"))
-    monkeypatch.setattr(TwinCritic, "at_once", at_once)
+    if as_on_a_gpu:
+        compile_heads = DDPG._compile
+
+        def compile_all(agent: DDPG) -> None:
+            compile_heads(agent)
+            agent.networks.encoders.compile(dynamic=False)
+
+        monkeypatch.setattr(DDPG, "_compile", compile_all)
+        monkeypatch.setattr(TwinCritic, "at_once", True)
+        monkeypatch.setattr(representation, "shift", augmentation._shift_by_index)
+        monkeypatch.setattr(augmentation, "_centred", augmentation._centred_at_once)
     check_in_double_precision(case, updates=5)
     assert case.agent().networks.critic._compiled_call_impl is not None
     # In bf16 it rounds elsewhere, but where eager mode computes in single precision, so does it.

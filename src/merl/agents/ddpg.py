@@ -295,8 +295,8 @@ class DDPG:
         parts: list[nn.Module] = [networks.critic_fusion, networks.critic, networks.actor]
         parts += [] if networks.actor_fusion is None else [networks.actor_fusion]
         parts += self.critic_target.values()
-        if self.device.type == "cuda":  # on a CPU convolutions are no faster for it
-            parts += networks.encoders.images.values()
+        if self.device.type == "cuda":  # shift, interleaving and casts become one kernel
+            parts.append(networks.encoders)  # on a CPU convolutions are no faster for it
         from torch._dynamo import config as dynamo
         from torch._functorch import config as functorch
 

@@ -64,7 +64,6 @@ class Randomness:
 
     Attributes:
         agent: the seed of initialisation, noise and shifts.
-        device: that of what is sampled from a replay on a GPU.
         actions: the uniformly random actions of the start.
         batches: what is sampled from replay.
     """
@@ -73,7 +72,7 @@ class Randomness:
         words = np.random.SeedSequence(seed).generate_state(5)
         self._seed, self._environment, self.agent = seed, int(words[0]), int(words[1])
         self.actions, self.batches = (np.random.default_rng(int(word)) for word in words[2:4])
-        self.device = int(words[4])
+        self._device = int(words[4])
 
     def environment(self, index: int = 0, restart: int = 0) -> int:
         """The seed of an environment's first reset; it goes on from there by itself.
@@ -85,6 +84,10 @@ class Randomness:
         if index == restart == 0:
             return self._environment
         return int(np.random.SeedSequence((self._seed, index, restart)).generate_state(1)[0])
+
+    def on_device(self, updates: int) -> int:
+        """The seed of what is sampled from a replay on a GPU, from so many updates on."""
+        return int(np.random.SeedSequence((self._device, updates)).generate_state(1)[0])
 
     def state_dict(self) -> dict[str, Any]:
         """The generators' states, as plain types."""

@@ -123,7 +123,12 @@ class Stretch:
         ]
         stage = Stage(self.environments, self.replay, stacks)
         update = make_update(
-            parts.agent, self.replay, parts.randomness, self.config, self.view.warn
+            parts.agent,
+            self.replay,
+            parts.randomness,
+            self.config,
+            self.view.warn,
+            progress.updates,
         )
         self.view.begin(self.run, progress.step)
         if not parts.films and self.config.eval.video != "none":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -42,6 +43,7 @@ def make_update(
     randomness: Randomness,
     config: TrainConfig,
     warn: Callable[[str], None],
+    updates: int = 0,
 ) -> Update:
     """What learns fastest where the agent lives.
 
@@ -51,15 +53,18 @@ def make_update(
         randomness: the run's random streams.
         config: of the run.
         warn: is told why a GPU does not hold the replay.
+        updates: that were made so far.
     """
     if agent.device.type == "cuda":
+        torch.cuda.empty_cache()  # what was timed is gone, but torch keeps its memory
         if config.replay.compress:
             warn("a compressed replay stays on the host: each update's batch is brought over")
         elif bytes_on_device(replay.lanes) > ROOM * torch.cuda.mem_get_info()[0]:
             warn("the replay does not fit on the GPU: each update's batch is brought over")
         else:
             copy = OnDevice(replay.lanes, agent.device)
-            return UpdateOnDevice(agent, copy, config.replay.batch_size, randomness.device)
+            seed = randomness.on_device(updates)
+            return UpdateOnDevice(agent, copy, config.replay.batch_size, seed)
         size = config.replay.batch_size
         return UpdateFromHost(agent, lambda: replay.sample(size, randomness.batches))
     return update_from_host(agent, replay, randomness, config)
@@ -87,7 +92,7 @@ class Recorded:
         self._aside = torch.cuda.Stream() if self._on_gpu else None  # type: ignore[no-untyped-call]
         self._graph: torch.cuda.CUDAGraph | None = None
         self._names: tuple[str, ...] = ()
-        self._values: Tensor | None = None
+        self._values = torch.empty(0)  # by name, where the graph leaves them
         self._made = 0
 
     def __call__(self) -> dict[str, Tensor]:
@@ -95,36 +100,48 @@ class Recorded:
         self._sigma.fill_(self._agent.config.noise(self._agent.step))
         self._made += 1
         if not self._on_gpu:
-            return self._learn()
-        if self._made <= self.WARM_UP:
-            return self._learn_aside()
-        if self._graph is None:
-            self._graph = self._record()
-        self._graph.replay()
-        assert self._values is not None
-        return dict(zip(self._names, self._values.clone().unbind(), strict=True))
+            values = self._learn()
+        elif self._made <= self.WARM_UP:
+            values = self._learn_aside()
+        else:
+            if self._graph is None:
+                self._graph = self._record()
+            self._graph.replay()
+            values = self._values.clone()
+        return dict(zip(self._names, values.unbind(), strict=True))
 
-    def _learn(self) -> dict[str, Tensor]:
+    def _learn(self) -> Tensor:
         batch = self._batch()
-        return self._agent.learn(batch, self._agent.draw(len(batch.action)))
+        told = self._agent.learn(batch, self._agent.draw(len(batch.action)))
+        self._names = tuple(told)
+        return torch.stack([value.float() for value in told.values()])
 
-    def _learn_aside(self) -> dict[str, Tensor]:
+    def _learn_aside(self) -> Tensor:
         """On a stream of its own, as CUDA graphs want their warm-up."""
         assert self._aside is not None
         self._aside.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._aside):
-            told = self._learn()
+            values = self._learn()
         torch.cuda.current_stream().wait_stream(self._aside)
-        return told
+        return values
 
     def _record(self) -> torch.cuda.CUDAGraph:
+        """On that stream, too: graphs that share one share what cuBLAS works in, to the last."""
         graph = torch.cuda.CUDAGraph()
         for generator in self._generators:
             graph.register_generator_state(generator)
-        with torch.cuda.graph(graph):
-            told = self._learn()
-            self._values = torch.stack([value.float() for value in told.values()])
-        self._names = tuple(told)
+        gc.collect()  # what it would free during the recording could end it
+        here = torch.cuda.stream(torch.cuda.current_stream())  # where a failure is to leave us
+        failure: Exception | None = None
+        try:
+            with here, torch.cuda.graph(graph, stream=self._aside):
+                try:
+                    self._values = self._learn()
+                except Exception as error:
+                    failure = error
+                    raise
+        except Exception as error:  # that the recording cannot be ended is but a consequence
+            raise failure or error from None
         return graph
 
 

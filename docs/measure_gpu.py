@@ -1,7 +1,9 @@
 """All that is to be measured on a GPU, in one go: python docs/measure_gpu.py --out FOLDER.
 
-Five parts, each written as soon as it is done; one that fails is told and does not stop the others:
+Six parts, each written as soon as it is done; one that fails is told and does not stop the others:
 
+agrees    that a recorded update is the update that is launched operation by operation, but for the
+          order in which a card adds; and that none of a hundred more waits for the card
 launches  of how many operations an update consists: what it costs without a CUDA graph, and much of
           it with one; the same on a CPU
 gains     the whole update, drawn on the card, as it is and with one thing changed at a time
@@ -54,7 +56,8 @@ class Form:
 
 def main(
     out: Path = Path("gpu"),
-    parts: tuple[Literal["launches", "gains", "profile", "update", "train"], ...] = (
+    parts: tuple[Literal["agrees", "launches", "gains", "profile", "update", "train"], ...] = (
+        "agrees",
         "launches",
         "gains",
         "profile",
@@ -71,7 +74,7 @@ def main(
     Args:
         out: the folder for what was found.
         parts: which.
-        agent: whose update, in gains and profile.
+        agent: whose update, in agrees, launches, gains and profile.
         batch_size: B, in all but train.
         updates: of a turn, in gains.
         repeats: turns of each side.
@@ -80,6 +83,7 @@ def main(
     console = Console(markup=False)
     console.print(circumstances())
     for name, part in {
+        "agrees": lambda: agrees(agent, batch_size),
         "launches": lambda: launches(agent),
         "gains": lambda: gains(agent, batch_size, updates, repeats),
         "profile": lambda: profiles(agent, batch_size),
@@ -111,6 +115,32 @@ def loop(repeats: int) -> Any:
     except MerlError as error:
         print(f"{error}: with preset laptop, by rays", file=sys.stderr)
         return shown(train, repeats=repeats, preset="laptop")
+
+
+def agrees(agent: str, batch_size: int) -> dict[str, float]:
+    """How far weights are apart after the same updates, recorded and not: of each tensor's norm."""
+    found = {}
+    for form in (Form(precision="fp32"), Form(), Form(compiled=True)):
+        recorded, learner = work_of(agent, batch_size, form)
+        launched, other = work_of(agent, batch_size, dataclasses.replace(form, graph=False))
+        for _ in range(5):
+            recorded()
+            launched()
+        pairs = zip(learner.networks.parameters(), other.networks.parameters(), strict=True)
+        with torch.no_grad():
+            apart = max(float((a - b).norm() / b.norm().clamp(min=1e-9)) for a, b in pairs)
+        if torch.cuda.is_available():
+            torch.cuda.set_sync_debug_mode("error")
+        try:
+            for _ in range(100 if torch.cuda.is_available() else 1):
+                recorded()
+        finally:
+            if torch.cuda.is_available():
+                torch.cuda.set_sync_debug_mode("default")
+        name = f"{form.precision}{', compiled' if form.compiled else ''}"
+        print(f"{name}: recorded and launched weights are {apart:.2g} apart; nothing waits")
+        found[name] = apart
+    return found
 
 
 class Launches(TorchDispatchMode):

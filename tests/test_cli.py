@@ -287,8 +287,6 @@ BAD = {
     "train reach_duplo --observations state": "--agent.vectors state",
     "train reach_duplo --updates-per-step inf": "must be finite and at least 0, not inf",
     "train reach_duplo --num-envs 0": "num-envs must be at least 1 and at most 1,024, not 0",
-    "bench update --json nowhere/bench.json": "nowhere/bench.json cannot be written: No such file",
-    "bench update --json .": ". cannot be written: Is a directory",
     "train reach_duplo --agent.vectors joints": "the environment gives ['proprio', 'state']",
     "train reach_duplo --image-size 8": "16",
     "train reach_duplo --renderer wrap": "'gl', 'warp'",
@@ -316,6 +314,42 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert error.count("\n") == 1
     assert BAD[line] in error
     assert list(tmp_path.iterdir()) == []
+
+
+NOT_TO_BE_WRITTEN = {
+    "nowhere/figures.json": "No such file or directory",
+    ".": "Is a directory",
+    "a" * 300: "File name too long",
+}
+
+
+@pytest.mark.parametrize("name", NOT_TO_BE_WRITTEN)
+@pytest.mark.parametrize("command", ["bench update", "evaluate nothing"])
+def test_where_nothing_can_be_written_is_said_before_the_work(
+    command: str,
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("merl.cli.bench.BENCHES", {"update": ()})  # nothing that could be called
+    assert main([*command.split(), "--json", name]) == 2
+    error = capsys.readouterr().err
+    assert f"merl: error: {name} cannot be written: {NOT_TO_BE_WRITTEN[name]}: " in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_to_be_written_is_as_it_was_until_then(tmp_path: Path) -> None:
+    figures, link = tmp_path / "figures.json", tmp_path / "link.json"
+    figures.write_text("of another run")
+    link.symlink_to(tmp_path / "elsewhere")
+    for path in (figures, link, tmp_path / "new.json"):
+        assert main(["evaluate", str(tmp_path / "none"), "--json", str(path)]) == 2
+    assert figures.read_text() == "of another run"
+    assert link.is_symlink()
+    assert not (tmp_path / "new.json").exists()
 
 
 def test_what_may_be_left_out_is_not_offered_as_none(capsys: pytest.CaptureFixture[str]) -> None:

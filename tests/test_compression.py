@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 
 import merl
-from merl.core import Batch, Transition
+from merl.core import Batch, MerlError, Transition
 from merl.replay import Replay, ReplayConfig, replay_bytes
 from merl.replay.backgrounds import STAGES, Backgrounds
 from merl.replay.compression import CompressedPictures
@@ -272,6 +272,22 @@ def test_backgrounds_are_made_of_what_the_disk_took(
     for number in range(3):
         np.testing.assert_array_equal(again[number], backgrounds[number])
     np.testing.assert_array_equal(again[2], np.median(pictures[[0, 2, 3, 4, 5]], axis=0))
+
+
+def test_pictures_whose_background_is_gone_are_refused(tmp_path: Path) -> None:
+    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    play(replay, 0, 49)
+    state = replay.state_dict()
+    starts = tmp_path / "observation.image.starts"
+    whole = starts.read_bytes()
+    starts.write_bytes(whole[:-1])
+    again = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    with pytest.raises(MerlError, match=r"image\.starts holds 6 of the 7 pictures"):
+        again.load_state_dict(state)
+    starts.write_bytes(whole)
+    again = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    again.load_state_dict(state)
+    assert_same(everything(again), everything(replay))
 
 
 def test_a_run_of_before_stays_with_the_backgrounds_that_it_kept(tmp_path: Path) -> None:

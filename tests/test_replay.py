@@ -623,7 +623,7 @@ def lengthen(run: Run, capacity: int) -> None:
     assert run.account.held()[-len(held) :] == held
 
 
-@pytest.mark.parametrize("capacity", [21, 29, 60])
+@pytest.mark.parametrize("capacity", [28, 29, 60])
 @pytest.mark.parametrize("compress", [False, True])
 def test_a_ring_that_has_wrapped_grows_too(tmp_path, capacity, compress):
     for more in range(0, 25, 4):  # wherever it stands

@@ -13,11 +13,13 @@ from gymnasium import spaces
 from rich.console import Console
 from torch import Tensor, nn
 
+import merl
 from merl.agents import AGENTS, make_agent
 from merl.agents.ddpg import DDPG, Draws
 from merl.bench import update as bench
 from merl.bench.plain import Plain
 from merl.core import Batch, MerlError
+from merl.training.machine import commit
 
 SIDE, PROPRIO, ACTIONS, BATCH, WIDTH = 24, 7, 4, 6, 16
 FEATURES = 32 * 5 * 5
@@ -138,6 +140,9 @@ def test_it_runs_and_shows_every_side(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "_stable_baselines", missing)
     result = bench.run(repeats=1, batch_size=2)
     assert json.loads(json.dumps(result)) == result
+    assert result["merl"] == merl.__version__
+    assert result["commit"] == commit()
+    assert {"torch", "lz4", "stable-baselines3"} <= result["versions"].keys()
     console = Console(width=200, markup=False)
     with console.capture() as capture:
         console.print(bench.table(result))

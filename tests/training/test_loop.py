@@ -67,32 +67,72 @@ def test_updates_per_step_are_held_exactly(hundredths: int) -> None:
     assert moment.step == 60
 
 
-@pytest.mark.parametrize("synchronous", [True, False])
-@pytest.mark.parametrize("step", [30, 60])
-def test_a_stop_waits_for_no_more_than_one_update(step: int, synchronous: bool) -> None:
-    """And what was left of a step is made up for when the run goes on."""
-    settings = dataclasses.replace(CONFIG, updates_per_step=7.0, synchronous=synchronous)
-    parts = Parts(settings)
-    stop = False
-    update = parts.update
+def stopped_after(update: int, parts: Parts) -> Moment:
+    """The last thing that is told if a signal comes within that update."""
+    stop, whole = False, parts.update
 
     def stopping() -> dict[str, torch.Tensor]:
         nonlocal stop
-        stop = stop or (parts.progress.step == step and parts.progress.updates % 7 == 2)
-        return update()
+        stop = stop or parts.progress.updates == update
+        return whole()
 
-    arguments = parts.stage, parts.agent, stopping, parts.progress, parts.randomness, settings
-    made = 0
+    arguments = parts.stage, parts.agent, stopping, parts.progress, parts.randomness, parts.config
     for moment in train(*arguments, lambda: stop):
-        made = moment.updates
         if stop:
-            break
-    assert moment.step == step if synchronous or step == 60 else step + 1
-    assert made == 7 * (step - 21) + 3
-    parts.update = update
-    *_, last = [*parts.moments()] or [moment]
-    assert last.step == 60
+            return moment
+    raise AssertionError("it ran to its end")
+
+
+MANY = dataclasses.replace(
+    CONFIG,
+    updates_per_step=7.0,
+    agent=dataclasses.replace(CONFIG.agent, noise_std=1.0, noise_std_end=0.0, noise_steps=60),
+)
+
+
+@pytest.mark.parametrize("step", [30, 31, 45, 60])
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_a_stop_waits_for_no_more_than_one_update(step: int, repeat: int) -> None:
+    """And what was left of a step is learnt as it would have been when the run goes on."""
+    settings = dataclasses.replace(MANY, action_repeat=repeat)
+    step += -step % repeat
+    whole, parts = Parts(settings), Parts(settings)
+    whole.run()
+    due = updates_due(step - 20, 7.0)
+    told = stopped_after(due - 5, parts)
+    assert (told.step, told.updates, parts.progress.updates) == (step, due - 4, due - 4)
+    first, *_ = moments = parts.run()
+    assert (first.step, first.updates, first.episodes) == (step, due, ())
+    assert "critic_loss" in first.learning
+    assert moments[-1].step == 60
     assert parts.progress.updates == 7 * 40
+    assert torch.equal(parts.weights(), whole.weights())
+
+
+def test_beside_the_environments_a_stop_waits_for_the_step() -> None:
+    """What was left would be learnt later, from more than was there."""
+    parts = Parts(dataclasses.replace(MANY, synchronous=False))
+    told = stopped_after(65, parts)
+    assert told.updates == 70
+    assert parts.run()[0].step == told.step + 1
+
+
+def test_who_is_stopped_in_what_was_left_takes_no_step() -> None:
+    parts = Parts(MANY)
+    assert stopped_after(65, parts).updates == 66
+    assert stopped_after(67, parts).updates == 68
+    assert parts.progress.step == 30
+    stopping = train(
+        parts.stage, parts.agent, parts.update, parts.progress, parts.randomness, MANY, lambda: True
+    )
+    assert next(stopping).step == 30
+    assert parts.progress.updates == 68
+
+
+def test_what_is_sampled_on_a_gpu_depends_on_the_updates_made() -> None:
+    seeds = [Randomness(seed).on_device(updates) for seed in (0, 1) for updates in (0, 1, 500)]
+    assert len(set(seeds)) == 6
+    assert Randomness(0).on_device(500) == seeds[2]
 
 
 def test_a_ratio_is_taken_as_it_is_written() -> None:

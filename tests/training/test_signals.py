@@ -81,3 +81,16 @@ def test_who_has_to_wait_is_told_for_what() -> None:
             [sys.executable, "-c", program % seconds], capture_output=True, check=True, text=True
         )
         assert done.stderr.count("a second signal (Ctrl-C) stops at once") == told
+
+
+def test_where_no_thread_is_to_be_had_it_is_a_wish_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr("threading._start_new_thread", refused)
+    monkeypatch.setattr("threading._start_joinable_thread", refused, raising=False)  # 3.13
+    with Interrupt().listening() as interrupt:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert interrupt.number == signal.SIGTERM

@@ -7,9 +7,6 @@ import io
 import json
 import os
 import re
-import shlex
-import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -88,19 +85,6 @@ def _choices(listed: re.Match[str]) -> str:
     return f"({', '.join(map(repr, names))})"
 
 
-def program() -> str:
-    """What to type to call this program again: `merl` if the shell would find it."""
-    found, called = shutil.which("merl"), Path(sys.argv[0])
-    if found or called.name != "merl":
-        return "merl"
-    return os.path.relpath(called)
-
-
-def resume_line(folder: Path) -> str:
-    """What to type to go on with a run."""
-    return f"{program()} resume {shlex.quote(str(folder))}"
-
-
 def check_writable(path: Path | None) -> None:
     """See to it, before long work, that a file can be written that the user asked for.
 
@@ -109,8 +93,8 @@ def check_writable(path: Path | None) -> None:
     """
     if path is None:
         return
-    there = path.exists()
     try:
+        there = os.path.lexists(path)
         path.open("a").close()
         if not there:
             path.unlink()

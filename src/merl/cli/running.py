@@ -9,7 +9,6 @@ from datetime import timedelta
 from rich.console import Console
 from rich.filesize import decimal
 
-from merl.cli.parsing import resume_line
 from merl.cli.summary import summarize
 from merl.core import MerlError, is_image
 from merl.replay import replay_bytes
@@ -20,7 +19,7 @@ from merl.training.console import ConsoleView
 from merl.training.environment import own_bounds
 from merl.training.parts import Parts
 from merl.training.resuming import taken_up
-from merl.training.run import Run
+from merl.training.run import Run, resume_line
 
 
 def begin(config: TrainConfig, what: str) -> int:

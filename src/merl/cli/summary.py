@@ -8,13 +8,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from merl.cli.parsing import resume_line
 from merl.core import MerlError
 from merl.report.figures import learning_curve
 from merl.report.references import Reference, references
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env
 from merl.training.evaluation import Act, Evaluation, evaluate
+from merl.training.run import resume_line
 from merl.training.stretch import Outcome
 
 FLOORS = ("random actions", "no motion")

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from merl.core import MerlError
+
 STAGES = (1, 5, 25)
 """A background is made after so many episodes' first pictures."""
 
@@ -21,11 +23,15 @@ class Backgrounds:
     Args:
         size: bytes of a picture.
         file: keeps the first pictures, one behind the other; without one they are in memory alone.
+
+    Attributes:
+        starts: how many first pictures there are.
     """
 
     def __init__(self, size: int, file: Path | None) -> None:
         self._size, self._file = size, file
-        self._starts = _whole(file, size)[: STAGES[-1]]
+        self._in_memory = np.empty((0, size), np.uint8)
+        self.starts = min(len(self._first()), STAGES[-1])
         self._made = self._medians()
         # A run that was begun when the backgrounds themselves were kept stays with those.
         former = _whole(file and file.with_suffix(".background"), size)
@@ -40,40 +46,51 @@ class Backgrounds:
         """One of them: (size,)."""
         return self._made[number]
 
-    @property
-    def starts(self) -> int:
-        """How many first pictures they are made of, and the next one will be."""
-        return len(self._starts)
-
     def begun(self, picture: NDArray[np.uint8]) -> None:
         """An episode begins so: after some of them the background is known better."""
         if self._final or self.starts == STAGES[-1]:
             return
         row = picture.reshape(1, -1)
-        if self._file is not None:
+        if self._file is None:
+            self._in_memory = np.concatenate([self._in_memory, row])
+        else:
             try:
                 _append(self._file, row, self.starts * self._size)
             except OSError:  # a full disk: the next episode will do
                 return
-        self._starts = np.concatenate([self._starts, row])
+        self.starts += 1
         if self.starts in STAGES:
             self._made.append(self._median(self.starts))
 
     def go_back(self, starts: int) -> None:
-        """Forget the first pictures after the first so many, and what was made of them."""
+        """Forget the first pictures after the first so many, and what was made of them.
+
+        Raises:
+            MerlError: there are not so many, so that what was kept could not be told any more.
+        """
         if self._final:
             return
-        self._starts = self._starts[:starts]
+        if starts > self.starts:
+            raise MerlError(
+                f"{self._file} holds {self.starts} of the {starts} pictures that the replay's are "
+                "kept as differences from: bring the whole folder back, or start a new run"
+            )
+        self.starts = starts
         self._made = self._medians()
+        self._in_memory = self._in_memory[:starts]
         if self._file is not None and self._file.exists():
-            os.truncate(self._file, self.starts * self._size)
+            os.truncate(self._file, starts * self._size)
+
+    def _first(self) -> NDArray[np.uint8]:
+        """The first pictures (n, size): read when they are wanted, which is seldom."""
+        return self._in_memory if self._file is None else _whole(self._file, self._size)
 
     def _medians(self) -> list[NDArray[np.uint8]]:
         black = np.zeros(self._size, np.uint8)
         return [black, *(self._median(stage) for stage in STAGES if stage <= self.starts)]
 
     def _median(self, starts: int) -> NDArray[np.uint8]:
-        median: NDArray[np.floating] = np.median(self._starts[:starts], axis=0)
+        median: NDArray[np.floating] = np.median(self._first()[:starts], axis=0)
         return median.astype(np.uint8)
 
 

@@ -110,9 +110,8 @@ def check_fits(
     room = {"of memory are available": available_memory()}
     if directory is not None:
         where = existing_parent(directory)
-        ours = sum(
-            file.stat().st_size for file in directory.rglob("*.bin")
-        )  # if it is opened again
+        # Those that are there, if it is opened again.
+        ours = sum(file.stat().st_size for file in directory.rglob("*.bin"))
         room[f"of disk are free in {where}"] = free_disk(where) + ours
     what, least = min(room.items(), key=lambda item: item[1])
     if bytes_of(config, steps) > least:

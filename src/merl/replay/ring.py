@@ -278,10 +278,10 @@ class Replay:
                 f"the replay does not hold moment {moments:,}, at which the checkpoint was taken: "
                 "it is not this run's, or was written to since; start a new run"
             )
-        if journal is not None:
-            journal.undo(moments)
         for name, starts in state.get("starts", {}).items():
             self._compressed[name].backgrounds.go_back(int(starts))
+        if journal is not None:
+            journal.undo(moments)
         self._take_over(moments, int(state["steps"]), bool(state["open"]))
         self._settled = moments
 

@@ -40,6 +40,8 @@ class Progress:
 class Moment:
     """What the loop tells after an environment step, or one step of each of several environments.
 
+    A run that goes on where updates were left begins with one that tells of those alone.
+
     Attributes:
         step: environment steps so far.
         updates: updates so far.
@@ -121,17 +123,21 @@ def train(
         progress: moved on as the run goes.
         randomness: the run's random streams.
         config: steps, seed steps, random steps, updates per step, batch size.
-        is_to_stop: whether the updates that are due are to be left for when the run goes on.
+        is_to_stop: whether updates that are due are to be left for when the run goes on; not asked
+            beside the environments, where what is left would be learnt from more than was there.
 
     Raises:
         NotFinite: an observation or a reward is no number; the replay does not take it in.
     """
     if progress.episodes == 0:
         stage.seed(randomness, progress)
-    learn = partial(_learn, update, progress, config, is_to_stop)
-    if config.synchronous or progress.step >= config.steps:
-        agent.step = progress.step
-        learn()  # what was left when it was stopped
+    stopping = is_to_stop if config.synchronous else lambda: False
+    learn = partial(_learn, update, progress, config, stopping)
+    # What was left when it was stopped, at the step that it was due at.
+    agent.step = max(0, progress.step - config.action_repeat * stage.count)
+    left = learn() if config.synchronous else {}
+    if left or stopping():
+        yield Moment(progress.step, progress.updates, left)
     while progress.step < config.steps:
         agent.step = progress.step
         learning: dict[str, Tensor] = {}

@@ -17,7 +17,9 @@ import itertools
 import json
 import os
 import re
+import shlex
 import shutil
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -263,6 +265,11 @@ def run_path(config: TrainConfig) -> Path:
     return next(p for p in itertools.chain([Path("runs") / name], numbered) if not _exists(p))
 
 
+def resume_line(folder: Path) -> str:
+    """What to type to go on with a run."""
+    return f"{_program()} resume {shlex.quote(str(folder))}"
+
+
 def refuse_existing(path: Path) -> None:
     """Never write into a folder that holds something.
 
@@ -271,7 +278,7 @@ def refuse_existing(path: Path) -> None:
     """
     if _exists(path):
         raise MerlError(
-            f"run folder {path} exists already: go on with `merl resume {path}`, or name another "
+            f"run folder {path} exists already: go on with `{resume_line(path)}`, or name another "
             "with --run-dir"
         )
 
@@ -329,3 +336,11 @@ def _recorded_spaces(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box
 def _module_folder(task: str) -> str | None:
     folder = module_folder(task)
     return None if folder is None else str(folder)
+
+
+def _program() -> str:
+    """What to type to call this program again: `merl` if the shell would find it."""
+    found, called = shutil.which("merl"), Path(sys.argv[0])
+    if found or called.name != "merl":
+        return "merl"
+    return os.path.relpath(called)

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from threading import Timer
 from types import FrameType
@@ -17,8 +17,6 @@ _HEARD = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 _APART = 0.1
 """Seconds from which on a second signal is one of its own: `timeout` and batch systems may send the
 same one twice, to the process and to its group."""
-
-
 PATIENCE = 3.0
 """Seconds after which who has asked to stop is told what is waited for."""
 
@@ -80,7 +78,8 @@ class Interrupt:
                 raise Stopped(number)
             self._telling = Timer(PATIENCE, _tell)
             self._telling.daemon = True
-            self._telling.start()
+            with suppress(RuntimeError):  # no thread is to be had: saving matters more
+                self._telling.start()
         # A closed terminal sends SIGHUP twice, and saving takes a moment.
         elif number != signal.SIGHUP and time.monotonic() - self._at > _APART:
             if sys.stdout.isatty():  # the live view hides it

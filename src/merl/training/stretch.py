@@ -20,7 +20,7 @@ from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
 from merl.training.plain import to_plain
 from merl.training.rollout import FrameStack, mean_metrics
-from merl.training.run import Run
+from merl.training.run import Run, resume_line
 from merl.training.signals import Interrupt
 from merl.training.updating import make_update
 
@@ -110,7 +110,7 @@ class Stretch:
                 raise
             raise EnvironmentFailed(
                 f"{failure}; the run is saved at step {step:,}: mend it, and go on with "
-                f"`merl resume {self.run.path}`"
+                f"`{resume_line(self.run.path)}`"
             ) from failure
 
     def _drive(self) -> Outcome:
@@ -138,7 +138,13 @@ class Stretch:
         self.clock.mark(progress)
         self._ended = progress.step
         moments = train(
-            stage, parts.agent, update, progress, parts.randomness, self.config, self._is_to_stop
+            stage,
+            parts.agent,
+            update,
+            progress,
+            parts.randomness,
+            self.config,
+            lambda: self.interrupt.number is not None,
         )
         for count, moment in enumerate(moments):
             if count == 0 and not moment.lost and None in self._environment_states():
@@ -201,7 +207,7 @@ class Stretch:
         if self.losses > most:
             self._save()
             step = self.parts.progress.step
-            saved = f"the run is saved at step {step:,}; go on with `merl resume {self.run.path}`"
+            saved = f"the run is saved at step {step:,}; go on with `{resume_line(self.run.path)}`"
             raise EnvironmentsLost(
                 f"an environment's process {what}, after {most} restarts: "
                 + (saved if step else "the run ends before its first step")

@@ -7,10 +7,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
 import pytest
+from rich.filesize import decimal
 from safetensors.torch import load_file
 from torch import Tensor
 from worker_envs import WORK
@@ -21,6 +23,7 @@ from merl.core import Batch
 from merl.report.curves import read_metrics
 from merl.training.checkpoint import Checkpoint
 from merl.training.run import Run
+from merl.training.timing import Arithmetic, Timing
 
 pytestmark = pytest.mark.timeout(120)
 _FLAGS = {
@@ -229,6 +232,41 @@ def test_of_several_environments_the_one_is_named_whose_reward_is_no_number(
     assert train(tmp_path / "run", "broken", "--num-envs", "3") == 3
     error = capsys.readouterr().err
     assert "the environment's reward is nan at step 74 of environment 1" in error
+
+
+def test_a_signal_is_heeded_between_the_updates_of_a_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learn, made = DDPG.learn, 0
+
+    def signalled(*given: Any) -> Any:
+        nonlocal made
+        made += 1
+        if made == 10:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return learn(*given)
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(DDPG, "learn", signalled)
+        patch.setattr(
+            "merl.training.parts.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
+        )
+        flags = ("--updates-per-step", "50", "--replay.batch-size", "8")
+        assert train(run, "plain", *flags, steps=22) == 128 + signal.SIGTERM
+    state = Checkpoint.find(Run.open(run).checkpoints).state()["progress"]
+    assert (state["step"], state["updates"]) == (21, 10)
+    assert cli.main(["resume", str(run)]) == 0
+    state = Checkpoint.find(Run.open(run).checkpoints).state()["progress"]
+    assert (state["step"], state["updates"]) == (22, 100)
+
+
+def test_what_several_environments_keep_is_told_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", "plain", "--num-envs", "3") == 0
+    taken = sum(file.stat().st_size for file in (tmp_path / "run" / "replay").rglob("*.bin"))
+    assert f"the replay takes {decimal(taken)} for" in capsys.readouterr().out
 
 
 def test_an_error_in_another_process_is_one_line(

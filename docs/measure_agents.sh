@@ -10,7 +10,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 preset=${PRESET:-state} steps=${STEPS:-100000} setting=${SETTING:-matched}
 [ $# -gt 0 ] || set -- 0
-easier="--start around holding --goal-reward both --floor smooth"
+easier="--start around holding --reward both --floor smooth"
 mkdir -p docs/data/agents
 for seed in "$@"; do
   for task in ${TASKS:-reach_duplo move_box lift_box}; do

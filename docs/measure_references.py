@@ -34,10 +34,11 @@ PUBLISHED = {
 }
 
 
-EASIER = {"start": ("around", "holding"), "goal_reward": "both", "floor": "smooth"}
+EASIER = {"start": ("around", "holding"), "reward": "both", "floor": "smooth"}
 """What is learnt from the state (docs/tasks.md)."""
 FORMS: list[tuple[str, dict[str, Any]]] = [
     *((task, {}) for task in TASKS),
+    *((task, {"reward": "staged"}) for task in BOX_TASKS),
     *((task, {"occluded": True}) for task in BOX_TASKS),
     *((task, EASIER) for task in BOX_TASKS),
 ]

@@ -292,7 +292,7 @@ BAD = {
     "train reach_duplo --renderer wrap": "'gl', 'warp'",
     "train reach_duplo --start around": "is solved where the hand starts around",
     "train move_box --preset smoke --start around --occluded": "occluded needs --start above",
-    "train reach_duplo --goal-reward far": "brings nothing to a goal",
+    "train reach_duplo --reward staged": "only 'paper'",
     "train reach_duplo --floor smooth": "has a rough floor",
     "train reach_duplo --minutes 0": "minutes must be above 0",
     "trian reach_duplo": "did you mean 'train'",

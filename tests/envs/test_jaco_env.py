@@ -253,7 +253,7 @@ def test_every_setting_is_a_plain_value():
         "observations": ("image", "proprio"),
         "occluded": False,
         "start": ("above",),
-        "goal_reward": "near",
+        "reward": "paper",
         "floor": "rough",
         "render_size": 480,
     }

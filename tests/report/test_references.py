@@ -5,7 +5,7 @@ import pytest
 from merl.envs.config import EnvConfig
 from merl.report.references import references
 
-EASIER = EnvConfig(start=("around", "holding"), goal_reward="both", floor="smooth")
+EASIER = EnvConfig(start=("around", "holding"), reward="both", floor="smooth")
 
 
 def test_every_task_has_a_floor_and_a_ceiling():
@@ -15,6 +15,8 @@ def test_every_task_has_a_floor_and_a_ceiling():
         ("lift_box", EnvConfig()),
         ("move_box", EnvConfig(occluded=True)),
         ("lift_box", EnvConfig(occluded=True)),
+        ("move_box", EnvConfig(reward="staged")),
+        ("lift_box", EnvConfig(reward="staged")),
         ("move_box", EASIER),
         ("lift_box", EASIER),
     ]:
@@ -42,7 +44,7 @@ def test_a_task_of_ones_own_has_none():
 
 
 @pytest.mark.parametrize(
-    "form", [EnvConfig(start=("around",)), EnvConfig(goal_reward="far"), EnvConfig(floor="smooth")]
+    "form", [EnvConfig(start=("around",)), EnvConfig(reward="far"), EnvConfig(floor="smooth")]
 )
 def test_a_form_that_was_not_measured_has_none(form):
     assert references("move_box", form) == ()

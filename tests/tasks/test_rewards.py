@@ -33,11 +33,11 @@ def test_reach(distance: float, expected: float) -> None:
     ("hand", "goal", "reaching", "pushing"),
     [
         (0.0, 0.0, 0.5, 0.5),
-        (NEAR, 0.01, 0.5, 0.5),
-        (NEAR, 0.0100001, 0.5, 0.5),
-        (NEAR, 0.06, 0.5, 0.05),  # the margin's end
-        (NEAR, 0.035, 0.5, 0.5 / (1 + 9 * 0.25)),  # a long tail: 1 / (1 + 9 share^2)
-        (NEAR, 0.21, 0.5, 0.5 / (1 + 9 * 16)),
+        (NEAR, 0.05, 0.5, 0.5),  # the bound is epsilon_pushing
+        (NEAR, 0.0500001, 0.5, 0.5),
+        (NEAR, 0.1, 0.5, 0.05),  # the margin's end
+        (NEAR, 0.075, 0.5, 0.5 / (1 + 9 * 0.25)),  # a long tail: 1 / (1 + 9 share^2)
+        (NEAR, 0.25, 0.5, 0.5 / (1 + 9 * 16)),
         (0.05, 0.0, 0.5, 0.0),  # the gate is open strictly below epsilon_reaching
         (FAR, 0.0, 0.5, 0.0),
         (0.1, 0.0, 0.05, 0.0),  # a box that was thrown to its target pays nothing
@@ -51,22 +51,73 @@ def test_move(hand: float, goal: float, reaching: float, pushing: float) -> None
 
 
 @pytest.mark.parametrize(
+    ("hand", "goal", "expected"),
+    [
+        # reaching, pushing, success; each a third
+        (0.0, 0.0, (1.0, 1.0, 1.0)),
+        (NEAR, 0.01, (1.0, 1.0, 1.0)),
+        (NEAR, 0.015, (1.0, 1.0, 1 / (1 + 9 * 0.25))),  # half of the success margin
+        (NEAR, 0.02, (1.0, 1.0, 0.1)),  # the end of the success margin
+        (NEAR, 0.05, (1.0, 1.0, 1 / (1 + 9 * 16))),
+        (NEAR, 0.1, (1.0, 0.1, 1 / (1 + 9 * 81))),  # the end of the pushing margin
+        (0.05, 0.0, (1.0, 0.0, 0.0)),  # the gate is open strictly below epsilon_reaching
+        (0.1, 0.0, (0.1, 0.0, 0.0)),
+    ],
+)
+def test_staged_move(hand: float, goal: float, expected: tuple[float, ...]) -> None:
+    terms = rewards.move(hand, goal, form="staged")
+    assert list(terms) == ["reaching", "pushing", "success"]
+    assert np.array(list(terms.values())) == pytest.approx(np.array(expected) / 3, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("hand", "height", "goal", "expected"),
+    [
+        # reaching, vertical, floating, lifting, success; each a fifth, the target at 0.18:
+        # floating = 2 (height - 0.03) / 0.14
+        (0.0, 0.18, 0.0, (1.0, 1.0, 1.0, 1.0, 1.0)),
+        (NEAR, 0.1, 0.08, (1.0, 1.0, 1.0, 1 / (1 + 9 * 0.36), 1 / (1 + 9 * 49))),  # full at 0.1
+        (NEAR, 0.065, 0.115, (1.0, 1.0, 0.5, 1 / (1 + 9 * 1.69), 1 / (1 + 9 * 110.25))),
+        (NEAR, 0.0351, 0.01, (1.0, 1.0, 2 * 0.0051 / 0.14, 1.0, 1.0)),
+        (NEAR, 0.035, 0.01, (1.0, 1.0, 0.0, 0.0, 0.0)),  # not above: on the floor
+        (FAR, 0.18, 0.0, (1.0, 1.0, 0.0, 0.0, 0.0)),  # a box that flies by itself
+        (NEAR, 0.3, 0.12, (1.0, 1.0, 1.0, 1 / (1 + 9 * 1.96), 1 / (1 + 9 * 121))),  # too high
+    ],
+)
+def test_staged_lift(hand: float, height: float, goal: float, expected: tuple[float, ...]) -> None:
+    terms = rewards.lift(hand, 1.0, height, 0.18, goal, form="staged")
+    assert list(terms) == ["reaching", "vertical", "floating", "lifting", "success"]
+    assert np.array(list(terms.values())) == pytest.approx(np.array(expected) / 5, abs=1e-4)
+
+
+def test_staged_floating_follows_the_height_of_the_target() -> None:
+    lifted = rewards.lift(NEAR, 1.0, 0.075, 0.22, 0.145, form="staged")
+    assert lifted["floating"] == pytest.approx(2 * 0.045 / 0.18 / 5)
+
+
+@pytest.mark.parametrize(
     ("distance", "share"), [(0.0, 1.0), (0.01, 1.0), (0.16, 0.5), (0.31, 0.0), (0.5, 0.0)]
 )
-def test_a_goal_that_is_seen_from_afar(distance: float, share: float) -> None:
-    moved = rewards.move(NEAR, distance, goal="far")
+def test_far_goal_term_is_a_straight_line(distance: float, share: float) -> None:
+    moved = rewards.move(NEAR, distance, form="far")
     assert moved["pushing"] == pytest.approx(share / 2, abs=1e-6)
-    assert rewards.move(FAR, distance, goal="far")["pushing"] == 0.0
-    lifted = rewards.lift(NEAR, 1.0, 0.0351, 0.18, distance, goal="far")
+    assert rewards.move(FAR, distance, form="far")["pushing"] == 0.0
+    lifted = rewards.lift(NEAR, 1.0, 0.0351, 0.18, distance, form="far")
     assert lifted["lifting"] == pytest.approx(share / 4, abs=1e-6)
-    assert rewards.lift(NEAR, 1.0, 0.035, 0.18, distance, goal="far")["lifting"] == 0.0
+    assert rewards.lift(NEAR, 1.0, 0.035, 0.18, distance, form="far")["lifting"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("distance", "share"), [(0.01, 1.0), (0.035, 1 / (1 + 9 * 0.25)), (0.06, 0.1)]
+)
+def test_near_goal_term_is_full_within_one_centimetre(distance: float, share: float) -> None:
+    assert rewards.move(NEAR, distance, form="near")["pushing"] == pytest.approx(share / 2)
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.01, 0.03, 0.06, 0.2, 0.5])
-def test_a_goal_that_is_seen_from_afar_and_from_near(distance: float) -> None:
-    near, far, both = (
-        rewards.move(NEAR, distance, goal=goal)["pushing"] for goal in get_args(rewards.GoalReward)
-    )
+def test_both_is_the_mean_of_near_and_far(distance: float) -> None:
+    forms: tuple[rewards.RewardForm, ...] = ("near", "far", "both")
+    near, far, both = (rewards.move(NEAR, distance, form=form)["pushing"] for form in forms)
     assert both == pytest.approx((near + far) / 2)
 
 
@@ -75,14 +126,14 @@ def test_a_goal_that_is_seen_from_afar_and_from_near(distance: float) -> None:
     [
         # reaching, vertical, floating, lifting; each a quarter, the target at 0.18
         (0.0, 1.0, 0.18, 0.0, (1.0, 1.0, 1.0, 1.0)),
-        (NEAR, 0.99, 0.0351, 0.01, (1.0, 1.0, 0.195, 1.0)),
+        (NEAR, 0.99, 0.0351, 0.05, (1.0, 1.0, 0.195, 1.0)),
         (NEAR, 0.99, 0.035, 0.0, (1.0, 1.0, 0.0350 / 0.18, 0.0)),  # not above: not off the floor
         (NEAR, 1.0, 0.025, 0.155, (1.0, 1.0, 0.025 / 0.18, 0.0)),  # hand at the box on the floor
         (FAR, 1.0, 0.18, 0.0, (1.0, 1.0, 0.0, 0.0)),  # a box that flies by itself
         (0.3, 0.0, 0.025, 0.2, (0.0, 0.1, 0.0, 0.0)),  # one margin below: 0.1
         (0.3, 0.495, 0.025, 0.2, (0.0, 0.1**0.25, 0.0, 0.0)),
         (0.3, -1.0, 0.025, 0.2, (0.0, 0.1 ** (1.99 / 0.99) ** 2, 0.0, 0.0)),
-        (NEAR, 1.0, 0.36, 0.18, (1.0, 1.0, 1.0, 1 / (1 + 9 * (0.17 / 0.05) ** 2))),  # too high
+        (NEAR, 1.0, 0.36, 0.18, (1.0, 1.0, 1.0, 1 / (1 + 9 * (0.13 / 0.05) ** 2))),  # too high
         (NEAR, 1.0, -0.01, 0.2, (1.0, 1.0, 0.0, 0.0)),
     ],
 )
@@ -109,16 +160,18 @@ def test_every_term_and_their_sum_stay_within_bounds() -> None:
         for _ in range(1000):
             hand = draw.uniform(0, 0.05) if at_object else draw.uniform(0.05, 0.15)
             height = draw.uniform(0.0351, 0.3) if off_floor else draw.uniform(-0.001, 0.035)
-            goal = draw.uniform(0, 0.01) if at_goal else draw.uniform(0.01, 0.15)
+            goal = draw.uniform(0, 0.05) if at_goal else draw.uniform(0.05, 0.15)
             cosine = np.cos(np.radians(draw.uniform(0, 180)))
-            lifted = rewards.lift(hand, cosine, height, 0.18, goal)
-            moved = rewards.move(hand, goal)
-            for terms in (rewards.reach(hand), moved, lifted):
-                assert all(0 <= term <= 1 / len(terms) + 1e-12 for term in terms.values())
-                assert 0 <= sum(terms.values()) <= 1 + 1e-12
-            assert (lifted["floating"] > 0) == (at_object and height > 0)
-            assert (lifted["lifting"] > 0) == (at_object and off_floor)
-            assert (moved["pushing"] > 0) == at_object
+            for form in get_args(rewards.RewardForm):
+                lifted = rewards.lift(hand, cosine, height, 0.18, goal, form=form)
+                moved = rewards.move(hand, goal, form=form)
+                for terms in (rewards.reach(hand), moved, lifted):
+                    assert all(0 <= term <= 1 / len(terms) + 1e-12 for term in terms.values())
+                    assert 0 <= sum(terms.values()) <= 1 + 1e-12
+                floats = off_floor if form == "staged" else height > 0
+                assert (lifted["floating"] > 0) == (at_object and floats)
+                assert (lifted["lifting"] > 0) == (at_object and off_floor)
+                assert (moved["pushing"] > 0) == at_object
             reached = (at_object, off_floor, at_goal)
             combinations[reached] = combinations.get(reached, 0) + 1
     assert min(combinations[gate] for gate in gates) == 1000

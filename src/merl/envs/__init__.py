@@ -44,7 +44,7 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
         task,
         occluded=settings.occluded,
         starts=settings.start,
-        goal=settings.goal_reward,
+        reward=settings.reward,
         floor=settings.floor,
     )
     return JacoEnv(scene, settings, render_mode)

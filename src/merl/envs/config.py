@@ -11,7 +11,7 @@ RendererName = Literal["gl", "warp"]
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
-GoalRewardName = Literal["near", "far", "both"]
+RewardName = Literal["paper", "staged", "near", "far", "both"]
 FloorName = Literal["rough", "smooth"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
@@ -48,10 +48,11 @@ class EnvConfig:
     `lift_box`, `around` (its open fingers around the box) or `holding` (closed around it). Of
     several, one is drawn in each episode."""
 
-    goal_reward: GoalRewardName = "near"
-    """How far the reward for the box's place reaches, in `move_box` and `lift_box`: `near` (a long
-    tail, to a tenth 5 cm away), `far` (a straight line, to nothing 30 cm away) or `both` (their
-    mean)."""
+    reward: RewardName = "paper"
+    """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5: full within 5 cm of the target),
+    `staged` (the authors' later code: one more term for the last centimetre), or the paper's terms
+    with another goal term: `near` (full within 1 cm, a long tail), `far` (a straight line, to 0 at
+    31 cm), `both` (their mean)."""
 
     floor: FloorName = "rough"
     """In `move_box` and `lift_box`: `rough` (dm_control's, a friction of 1) or `smooth` (0.2, for
@@ -64,7 +65,7 @@ class EnvConfig:
         check_choice("renderer", self.renderer, get_args(RendererName))
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
-        check_choice("goal_reward", self.goal_reward, get_args(GoalRewardName))
+        check_choice("reward", self.reward, get_args(RewardName))
         check_choice("floor", self.floor, get_args(FloorName))
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(

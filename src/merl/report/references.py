@@ -60,7 +60,7 @@ def form(task: str, env: EnvConfig) -> str:
     parts = {
         "occluded": "occluded",
         "start": "+".join(env.start),
-        "goal_reward": env.goal_reward,
+        "reward": env.reward,
         "floor": env.floor,
     }
     changed = (told for name, told in parts.items() if getattr(env, name) != getattr(plain, name))

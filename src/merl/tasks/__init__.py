@@ -13,18 +13,18 @@ from merl.tasks.jaco import JacoTask
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
-from merl.tasks.rewards import GoalReward
+from merl.tasks.rewards import RewardForm
 
 __all__ = [
     "BOX_TASKS",
     "TASKS",
     "Floor",
-    "GoalReward",
     "HandStart",
     "JacoTask",
     "LiftBox",
     "MoveBox",
     "ReachDuplo",
+    "RewardForm",
     "check_versions",
     "make_task",
 ]
@@ -41,7 +41,7 @@ def make_task(
     *,
     occluded: bool = False,
     starts: tuple[HandStart, ...] = ABOVE,
-    goal: GoalReward = "near",
+    reward: RewardForm = "paper",
     floor: Floor = "rough",
 ) -> JacoTask:
     """A task by its name.
@@ -50,7 +50,7 @@ def make_task(
         name: a key of `TASKS`.
         occluded: with a disc between camera and object.
         starts: where the hand starts; of several, one is drawn in each episode.
-        goal: how far the reward for the object's place reaches, where it has one.
+        reward: which reward, for the tasks with a target.
         floor: how it lets a box slide.
 
     Raises:
@@ -63,15 +63,17 @@ def make_task(
             raise MerlError(
                 "under the disc the hand has no room at the box: occluded needs --start above"
             )
-        return BOX_TASKS[name](occluded=occluded, starts=starts, goal=goal, floor=floor)
+        return BOX_TASKS[name](occluded=occluded, starts=starts, reward=reward, floor=floor)
     if occluded:
         raise MerlError(f"{name} has no occluded form: choose from {', '.join(BOX_TASKS)}")
     if starts != ABOVE:
         raise MerlError(
             f"{name} is solved where the hand starts {starts[0]}: only {', '.join(BOX_TASKS)} can"
         )
-    if goal != "near":
-        raise MerlError(f"{name} brings nothing to a goal: only {', '.join(BOX_TASKS)} do")
+    if reward != "paper":
+        raise MerlError(
+            f"{name} has no reward {reward!r}, only 'paper': {', '.join(BOX_TASKS)} have others"
+        )
     if floor != "rough":
         raise MerlError(f"{name} has a rough floor: only {', '.join(BOX_TASKS)} have another")
     return TASKS[name]()

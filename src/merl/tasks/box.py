@@ -13,7 +13,7 @@ from dm_control.entities import props
 from dm_control.manipulation.shared import workspaces
 
 from merl.tasks.jaco import Box, JacoTask, Position
-from merl.tasks.rewards import GOAL_DISTANCE, GoalReward
+from merl.tasks.rewards import SUCCESS_DISTANCE, RewardForm
 from merl.tasks.simulator import quiet_inverse_kinematics
 
 BOX_HALF_SIZE = 0.025
@@ -60,17 +60,17 @@ class BoxTask(JacoTask):
         occluded: put a disc between camera and box.
         starts: where the hand starts; of several, one is drawn in each episode. Under the disc
             there is no room for it at the box.
-        goal: how far the reward for the box's place reaches.
+        reward: which reward.
         floor: how it lets the box slide, and the fingers.
 
     Attributes:
-        occluded, goal: the same.
+        occluded, reward: as given.
         place: where the box is to be brought, m.
         place_over_disc: the same when `occluded`, m.
         disc_radius: of the disc, m.
     """
 
-    success_distance = GOAL_DISTANCE
+    success_distance = SUCCESS_DISTANCE
     place: Position
     place_over_disc: Position
     disc_radius: float
@@ -79,13 +79,15 @@ class BoxTask(JacoTask):
         self,
         occluded: bool = False,
         starts: tuple[HandStart, ...] = ABOVE,
-        goal: GoalReward = "near",
+        reward: RewardForm = "paper",
         floor: Floor = "rough",
     ) -> None:
         size = [BOX_HALF_SIZE] * 3
         box = props.Primitive(geom_type="box", size=size, mass=BOX_MASS, rgba=_RED, name="box")
         super().__init__(box, BOX_HALF_SIZE, self.place_over_disc if occluded else self.place)
-        self.occluded, self.goal, self._starts = occluded, goal, starts
+        self.occluded, self.reward, self._starts = occluded, reward, starts
+        if reward == "staged":
+            self.term_names = (*self.term_names, "success")
         self._furnish()
         if floor == "smooth":
             ground = self._arena.mjcf_model.find("geom", "ground")

@@ -30,7 +30,7 @@ class LiftBox(BoxTask):
         return VERTICAL_COSINE_AROUND_DISC if self.occluded else rewards.VERTICAL_COSINE
 
     def reward_terms(self, physics: mjcf.Physics) -> rewards.Terms:
-        """Eq. 5: `reaching`, `vertical`, `floating` and `lifting`, each in [0, 1/4]."""
+        """Eq. 5: `reaching`, `vertical`, `floating`, `lifting`; `staged` also has `success`."""
         assert self.target is not None
         return rewards.lift(
             self.hand_distance(physics),
@@ -39,5 +39,5 @@ class LiftBox(BoxTask):
             target_height=float(self.target[2]),
             goal_distance=self.goal_distance(physics),
             vertical_cosine=self.vertical_cosine,
-            goal=self.goal,
+            form=self.reward,
         )

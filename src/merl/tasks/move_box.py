@@ -39,7 +39,7 @@ class MoveBox(BoxTask):
         )
 
     def reward_terms(self, physics: mjcf.Physics) -> rewards.Terms:
-        """Eq. 4: `reaching` and `pushing`, each in [0, 1/2]."""
+        """Eq. 4: `reaching` and `pushing`; the reward `staged` also has `success`."""
         return rewards.move(
-            self.hand_distance(physics), self.goal_distance(physics), goal=self.goal
+            self.hand_distance(physics), self.goal_distance(physics), form=self.reward
         )

@@ -1,7 +1,7 @@
 """The rewards of the paper (appendix B.2, Eqs. 3 to 5) as pure functions that return named terms.
 
-Each term lies in [0, 1/N] with N the number of a task's stages, so that their sum, the reward, lies
-in [0, 1]. Distances and heights are in metres.
+Each term lies in [0, 1/N], where N is the number of stages of the task. Their sum is the reward, in
+[0, 1]. Distances and heights are in metres.
 """
 
 from __future__ import annotations
@@ -14,13 +14,17 @@ REACHING_DISTANCE = 0.05
 """epsilon_reaching: the hand is at the object when its tool centre point is this near, m."""
 REACHING_MARGIN = 0.05
 """Beyond epsilon_reaching the reward falls off as a gaussian of this width, to 0.1 there, m."""
-GOAL_DISTANCE = 0.01
-"""epsilon_pushing and epsilon_lifting: the object is at its target when it is this near, m."""
+GOAL_DISTANCE = 0.05
+"""epsilon_pushing and epsilon_lifting: the goal term is full when the object is this near to its
+target, m (the authors' later code)."""
 GOAL_MARGIN = 0.05
-"""Beyond it the reward falls off with a long tail, to 0.1 at this distance more, m."""
+"""Beyond that distance the goal term falls off with a long tail, to 0.1 after this margin, m."""
+SUCCESS_DISTANCE = 0.01
+"""The task is solved when the object is this near to its target, m (MERL B.1)."""
+SUCCESS_MARGIN = 0.01
+"""Margin of the `success` term of the reward `staged`, long tail, m (the authors' later code)."""
 FAR_GOAL_MARGIN = 0.3
-"""In place of that, where the reward is to tell from afar which way the goal is: it falls off in a
-straight line, to 0 at this distance more, m."""
+"""Margin of the reward `far`: a straight line, to 0 after this margin, m."""
 VERTICAL_COSINE = 0.99
 """1 - epsilon_vertical: the hand points down when the cosine of its tilt is at least this."""
 VERTICAL_MARGIN = 0.99
@@ -28,9 +32,22 @@ VERTICAL_MARGIN = 0.99
 FLOATING_HEIGHT = 0.035
 """epsilon_floating: the object is off the floor when its centre is above this, m."""
 
-GoalReward = Literal["near", "far", "both"]
-"""How far the reward for the object's place reaches: `GOAL_MARGIN`, `FAR_GOAL_MARGIN`, or the mean
-of the two, which tells from afar which way the goal is and still pays for the last centimetres."""
+FLOATING_FROM = 0.03
+"""Height of the object's centre at which the `floating` term of `staged` starts, m."""
+FLOATING_BELOW_TARGET = 0.01
+"""That term is scaled to a height this far below the target, m ..."""
+FLOATING_SLOPE = 2.0
+"""... and multiplied by this, so that it is full half-way up."""
+
+RewardForm = Literal["paper", "staged", "near", "far", "both"]
+"""The reward of the tasks with a target.
+
+- `paper`: Eqs. 4 and 5 with epsilon_pushing = epsilon_lifting = 0.05 as bound and margin.
+- `staged`: the authors' later code. It adds a `success` term (N = 3 and 5); `floating` is steeper
+  and paid only while the object is off the floor.
+- `near`, `far`, `both`: Eqs. 4 and 5 with another goal term: bound 0.01 and margin 0.05 with a long
+  tail; bound 0.01 and a straight line to 0.31 m; the mean of the two.
+"""
 Terms = dict[str, float]
 
 
@@ -46,22 +63,25 @@ def reach(hand_distance: float) -> Terms:
     return {"reaching": _near(hand_distance)}
 
 
-def move(hand_distance: float, goal_distance: float, *, goal: GoalReward = "near") -> Terms:
-    """Eq. 4, N = 2: bring the object to a place on the floor; it counts while the hand is at it.
+def move(hand_distance: float, goal_distance: float, *, form: RewardForm = "paper") -> Terms:
+    """Eq. 4: bring the object to a place on the floor, with the hand at the object.
 
     Args:
         hand_distance: from the tool centre point to the object, m.
         goal_distance: from the object to its target, m.
-        goal: how far the reward for the object's place reaches.
+        form: which reward.
 
     Returns:
-        `reaching` and `pushing`, each in [0, 1/2].
+        `reaching` and `pushing`, each in [0, 1/2]; `staged`: also `success`, each in [0, 1/3].
     """
     at_object = hand_distance < REACHING_DISTANCE
-    return _stages(
-        reaching=_near(hand_distance),
-        pushing=_at_goal(goal_distance, goal) if at_object else 0.0,
-    )
+    terms = {
+        "reaching": _near(hand_distance),
+        "pushing": _at_goal(goal_distance, form) if at_object else 0.0,
+    }
+    if form == "staged":
+        terms["success"] = _solved(goal_distance) if at_object else 0.0
+    return _shares(terms)
 
 
 def lift(
@@ -72,12 +92,12 @@ def lift(
     goal_distance: float,
     *,
     vertical_cosine: float = VERTICAL_COSINE,
-    goal: GoalReward = "near",
+    form: RewardForm = "paper",
 ) -> Terms:
-    """Eq. 5, N = 4: raise the object to a place in the air, with the hand pointing down.
+    """Eq. 5: raise the object to a place in the air, with the hand pointing down.
 
-    Eq. 5 names for its last row the object's height alone; that the hand must be at the object
-    there too is ours (docs/paper.md): what flies or rolls by itself is not lifted.
+    The last row of Eq. 5 asks only for the object's height. As in the authors' later code, the hand
+    must be at the object there too (docs/paper.md): a box that was thrown is not lifted.
 
     Args:
         hand_distance: from the tool centre point to the object, m.
@@ -86,23 +106,33 @@ def lift(
         target_height: of the target above the floor, m, above 0.
         goal_distance: from the object to its target, m.
         vertical_cosine: 1 - epsilon_vertical, from which on the hand counts as vertical.
-        goal: how far the reward for the object's place reaches.
+        form: which reward.
 
     Returns:
-        `reaching`, `vertical`, `floating` and `lifting`, each in [0, 1/4].
+        `reaching`, `vertical`, `floating` and `lifting`, each in [0, 1/4]; `staged`: also
+        `success`, each in [0, 1/5].
     """
     at_object = hand_distance < REACHING_DISTANCE
     off_floor = at_object and height > FLOATING_HEIGHT
-    return _stages(
-        reaching=_near(hand_distance),
-        vertical=_upright(tilt_cosine, vertical_cosine),
-        floating=min(max(height / target_height, 0.0), 1.0) if at_object else 0.0,
-        lifting=_at_goal(goal_distance, goal) if off_floor else 0.0,
-    )
+    if form == "staged":
+        top = target_height - FLOATING_BELOW_TARGET
+        raised = FLOATING_SLOPE * (height - FLOATING_FROM) / (top - FLOATING_FROM)
+        floats = off_floor
+    else:
+        raised, floats = height / target_height, at_object
+    terms = {
+        "reaching": _near(hand_distance),
+        "vertical": _upright(tilt_cosine, vertical_cosine),
+        "floating": min(max(raised, 0.0), 1.0) if floats else 0.0,
+        "lifting": _at_goal(goal_distance, form) if off_floor else 0.0,
+    }
+    if form == "staged":
+        terms["success"] = _solved(goal_distance) if off_floor else 0.0
+    return _shares(terms)
 
 
-def _stages(**terms: float) -> Terms:
-    """Each stage's term, from [0, 1] to its share of the reward."""
+def _shares(terms: Terms) -> Terms:
+    """Divide terms in [0, 1] by their number, so that they sum to the reward."""
     return {name: value / len(terms) for name, value in terms.items()}
 
 
@@ -111,12 +141,21 @@ def _near(distance: float) -> float:
     return float(tolerance(distance, bounds, margin=REACHING_MARGIN, sigmoid="gaussian"))
 
 
-def _at_goal(distance: float, goal: GoalReward) -> float:
-    bounds = (0.0, GOAL_DISTANCE)
+def _at_goal(distance: float, form: RewardForm) -> float:
+    def tail(bound: float) -> float:
+        return float(tolerance(distance, (0.0, bound), margin=GOAL_MARGIN, sigmoid="long_tail"))
+
+    if form in ("paper", "staged"):
+        return tail(GOAL_DISTANCE)
     linear = {"sigmoid": "linear", "value_at_margin": 0.0}
-    near = float(tolerance(distance, bounds, margin=GOAL_MARGIN, sigmoid="long_tail"))
-    far = float(tolerance(distance, bounds, margin=FAR_GOAL_MARGIN, **linear))
-    return {"near": near, "far": far, "both": (near + far) / 2}[goal]
+    far = float(tolerance(distance, (0.0, SUCCESS_DISTANCE), margin=FAR_GOAL_MARGIN, **linear))
+    near = tail(SUCCESS_DISTANCE)
+    return {"near": near, "far": far, "both": (near + far) / 2}[form]
+
+
+def _solved(distance: float) -> float:
+    bounds = (0.0, SUCCESS_DISTANCE)
+    return float(tolerance(distance, bounds, margin=SUCCESS_MARGIN, sigmoid="long_tail"))
 
 
 def _upright(cosine: float, enough: float) -> float:

@@ -77,15 +77,18 @@ class Randomness:
         self._device = int(words[4])
 
     def environment(self, index: int = 0, restart: int = 0) -> int:
-        """The seed of an environment's first reset; it goes on from there by itself.
+        """Return the seed of an environment's first reset, in [0, 2^31).
 
         Args:
             index: of the environment.
-            restart: how often it was made anew.
+            restart: how often the environments were restarted.
         """
         if index == restart == 0:
-            return self._environment
-        return int(np.random.SeedSequence((self._seed, index, restart)).generate_state(1)[0])
+            seed = self._environment
+        else:
+            words = np.random.SeedSequence((self._seed, index, restart)).generate_state(1)
+            seed = int(words[0])
+        return seed % 2**31  # many simulators take the seed as a signed 32-bit integer
 
     def on_device(self, updates: int) -> int:
         """The seed of what is sampled from a replay on a GPU, from so many updates on."""

@@ -23,7 +23,7 @@ def to_plain(config: Any) -> dict[str, Any]:
 
 
 def from_plain(cls: type[T], plain: Mapping[str, Any], **narrower: type) -> T:
-    """The config that `to_plain` took apart; fields that are not there keep their defaults.
+    """Restore a config from `to_plain()`; missing fields take their defaults.
 
     Args:
         cls: the dataclass.
@@ -31,12 +31,14 @@ def from_plain(cls: type[T], plain: Mapping[str, Any], **narrower: type) -> T:
         **narrower: the type of a field that is annotated with a base of it.
 
     Raises:
-        TypeError: a value is not of its field's type.
+        TypeError: a value is not of its field's type, or a field is unknown: without it the run
+            would silently continue as another one.
     """
     hints = typing.get_type_hints(cls) | narrower
-    known = {
-        name: _restore(name, hints[name], value) for name, value in plain.items() if name in hints
-    }
+    for name in plain:
+        if name not in hints:
+            raise TypeError(f"{name} is not known to this version of merl")
+    known = {name: _restore(name, hints[name], value) for name, value in plain.items()}
     return cls(**known)
 
 

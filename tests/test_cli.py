@@ -496,6 +496,7 @@ def test_ctrl_c_before_training_says_that_nothing_was_written(
         (lambda record: record["config"]["agent"].update(tau=5), "tau must lie in (0, 1]"),
         (lambda record: record["config"]["agent"].update(conv_strides=[2, "1"]), "strides is '1'"),
         (lambda record: record["config"].update(seed=True), "seed is True"),
+        (lambda record: record["config"]["env"].update(goal="near"), "goal is not known to this"),
         (lambda record: record.pop("machine"), "it has no 'machine'"),
         (lambda record: record.update(resumed=3), "cannot be read"),
         (lambda record: record.update(format=99), "it has format 99"),

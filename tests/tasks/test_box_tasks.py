@@ -138,6 +138,27 @@ def test_success_and_rewards_follow_the_distances(episodes):
         assert 0 <= task.get_reward(physics) <= 1
 
 
+@pytest.mark.parametrize("name", BOX_TASKS)
+def test_staged_reward_pays_most_within_one_centimetre_of_the_target(name):
+    task = make_task(name, reward="staged")
+    physics = task.compile()
+    task.start_episode(physics, np.random.RandomState(0))
+
+    def terms(box):
+        physics.data.qpos[-7:] = (*box, 1.0, 0.0, 0.0, 0.0)
+        physics.forward()
+        return task.reward_terms(physics)
+
+    hand = task.tool_center_point(physics)
+    for offset, success in ((0.01, 1.0), (0.02, 0.1)):
+        task.target = hand + (0.0, 0.0, offset)
+        paid = terms(hand)
+        assert tuple(paid) == task.term_names
+        assert task.term_names[-1] == "success"
+        assert paid["success"] == pytest.approx(success / len(paid))
+    assert terms(hand + (0.051, 0.0, 0.0))["success"] == 0.0
+
+
 def test_doing_nothing_is_paid_for_an_upright_hand_alone(episodes):
     """The hand starts vertical: a rising return proves little until it passes this one."""
     terms = episodes.task.reward_terms(episodes.start(4))

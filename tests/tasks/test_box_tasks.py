@@ -151,12 +151,12 @@ def test_staged_reward_pays_most_within_one_centimetre_of_the_target(name):
 
     hand = task.tool_center_point(physics)
     for offset, success in ((0.01, 1.0), (0.02, 0.1)):
-        task.target = hand + (0.0, 0.0, offset)
+        task.target = hand + np.array([0.0, 0.0, offset])
         paid = terms(hand)
         assert tuple(paid) == task.term_names
         assert task.term_names[-1] == "success"
         assert paid["success"] == pytest.approx(success / len(paid))
-    assert terms(hand + (0.051, 0.0, 0.0))["success"] == 0.0
+    assert terms(hand + np.array([0.051, 0.0, 0.0]))["success"] == 0.0
 
 
 def test_doing_nothing_is_paid_for_an_upright_hand_alone(episodes):

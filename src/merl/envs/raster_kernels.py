@@ -74,12 +74,35 @@ class Level:
     height: int
 
 
+@wp.struct
+class Surfaces:
+    """What can be hit, as `raster_scene.Scene`: triangles, planes, and what they look like."""
+
+    drawn: wp.array(dtype=int)  # the model's geoms that are drawn; all other geoms count in these
+    vertices: wp.array(dtype=wp.vec3)
+    geom_of_vertex: wp.array(dtype=int)
+    triangles: wp.array(dtype=wp.vec3i)
+    geom_of: wp.array(dtype=int)
+    facing: wp.array(dtype=wp.vec4)  # of a triangle's plane: above 0 for points in front of it
+    normals: wp.array(dtype=wp.vec3)
+    normal_of: wp.array(dtype=wp.vec3i)
+    coordinates: wp.array(dtype=wp.vec2)
+    coordinate_of: wp.array(dtype=wp.vec3i)
+    density: wp.array(dtype=float)  # texels per metre
+    planes: wp.array(dtype=int)
+    plane_sizes: wp.array(dtype=wp.vec2)  # half of each edge, m; infinite if not above 0
+    materials: wp.array(dtype=Material)
+    texels: wp.array(dtype=wp.vec3)
+    levels: wp.array(dtype=Level)
+    sky: int  # the level with the sky's cube map, -1 without
+
+
 @wp.kernel
 def place_geoms(
+    surfaces: Surfaces,
     views: wp.array(dtype=View),
     positions: wp.array(dtype=wp.vec3),
     rotations: wp.array(dtype=wp.mat33),
-    which: wp.array(dtype=int),
     out_rotations: wp.array2d(dtype=wp.mat33),
     out_offsets: wp.array2d(dtype=wp.vec3),
     out_eyes: wp.array2d(dtype=wp.vec4),
@@ -88,7 +111,7 @@ def place_geoms(
     v, g = wp.tid()
     view = views[v]
     inverse = wp.transpose(view.axes)
-    geom = which[g]
+    geom = surfaces.drawn[g]
     out_rotations[v, g] = inverse * rotations[geom]
     out_offsets[v, g] = inverse * (positions[geom] - view.eye)
     # Where the view looks from, in the geom's frame: a point, or a direction without a place.
@@ -101,29 +124,33 @@ def place_geoms(
         out_eyes[v, g] = wp.vec4(eye[0], eye[1], eye[2], 1.0)
 
 
+@wp.func
+def in_line(z: float) -> float:
+    """What an orthographic view has for 1 / depth: positive within a kilometre, and linear."""
+    return 1.0 + 1.0e-3 * z
+
+
 @wp.kernel
 def project(
+    surfaces: Surfaces,
     views: wp.array(dtype=View),
     rotations: wp.array2d(dtype=wp.mat33),
     offsets: wp.array2d(dtype=wp.vec3),
-    vertices: wp.array(dtype=wp.vec3),
-    geoms: wp.array(dtype=int),
-    v: int,
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array2d(dtype=wp.vec3),
 ):
     """Each vertex as (column, row, 1 / depth); 1 / depth <= 0 marks one before the near plane."""
-    i = wp.tid()
+    v, i = wp.tid()
     view = views[v]
-    g = geoms[i]
-    p = rotations[v, g] * vertices[i] + offsets[v, g]
+    g = surfaces.geom_of_vertex[i]
+    p = rotations[v, g] * surfaces.vertices[i] + offsets[v, g]
     half = 0.5 * float(view.size)
     if view.ortho == 1:
-        out[i] = wp.vec3(half + view.focal * p[0], half - view.focal * p[1], 1.0e-3 * (1.0e3 + p[2]))
+        out[v, i] = wp.vec3(half + view.focal * p[0], half - view.focal * p[1], in_line(p[2]))
     elif -p[2] < view.near:
-        out[i] = wp.vec3(0.0, 0.0, -1.0)
+        out[v, i] = wp.vec3(0.0, 0.0, -1.0)
     else:
         inverse = -1.0 / p[2]
-        out[i] = wp.vec3(
+        out[v, i] = wp.vec3(
             half + view.focal * p[0] * inverse, half - view.focal * p[1] * inverse, inverse
         )
 
@@ -191,52 +218,48 @@ def on_near_plane(p: wp.vec3, q: wp.vec3, view: View) -> wp.vec3:
 
 @wp.kernel
 def cover(
+    surfaces: Surfaces,
     views: wp.array(dtype=View),
     rotations: wp.array2d(dtype=wp.mat33),
     offsets: wp.array2d(dtype=wp.vec3),
-    vertices: wp.array(dtype=wp.vec3),
-    geoms: wp.array(dtype=int),
-    triangles: wp.array(dtype=wp.vec3i),
-    projected: wp.array(dtype=wp.vec3),
-    planes: wp.array(dtype=wp.vec4),
-    geom_of: wp.array(dtype=int),
     eyes: wp.array2d(dtype=wp.vec4),
+    projected: wp.array2d(dtype=wp.vec3),
     v: int,
     keys: wp.array(dtype=Any),
 ):
     """Write each triangle where it is the nearest so far; clip what crosses the near plane."""
     t = wp.tid()
-    if wp.dot(planes[t], eyes[v, geom_of[t]]) <= 0.0:
+    g = surfaces.geom_of[t]
+    if wp.dot(surfaces.facing[t], eyes[v, g]) <= 0.0:  # seen from behind
         return
-    corners = triangles[t]
-    a = projected[corners[0]]
-    b = projected[corners[1]]
-    c = projected[corners[2]]
+    corners = surfaces.triangles[t]
+    a = projected[v, corners[0]]
+    b = projected[v, corners[1]]
+    c = projected[v, corners[2]]
     size = views[v].size
     if a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0:
         draw_triangle(a, b, c, t, size, keys)
     elif a[2] > 0.0 or b[2] > 0.0 or c[2] > 0.0:
         view = views[v]
-        g = geoms[corners[0]]
         # Turn the triangle until its first corner is in front and its last is behind.
         i, j, k = corners[0], corners[1], corners[2]
         for _ in range(2):
-            if not (projected[i][2] > 0.0 and projected[k][2] <= 0.0):
+            if not (projected[v, i][2] > 0.0 and projected[v, k][2] <= 0.0):
                 first = i
                 i = j
                 j = k
                 k = first
-        rotation, offset = rotations[v, g], offsets[v, g]
-        p = rotation * vertices[i] + offset
-        q = rotation * vertices[j] + offset
-        r = rotation * vertices[k] + offset
-        from_p = on_near_plane(r, p, view)
-        if projected[j][2] > 0.0:
-            from_q = on_near_plane(r, q, view)
-            draw_triangle(projected[i], projected[j], from_q, t, size, keys)
-            draw_triangle(projected[i], from_q, from_p, t, size, keys)
+        p = rotations[v, g] * surfaces.vertices[i] + offsets[v, g]
+        q = rotations[v, g] * surfaces.vertices[j] + offsets[v, g]
+        r = rotations[v, g] * surfaces.vertices[k] + offsets[v, g]
+        start = projected[v, i]
+        end = on_near_plane(r, p, view)
+        if projected[v, j][2] > 0.0:
+            corner = on_near_plane(r, q, view)
+            draw_triangle(start, projected[v, j], corner, t, size, keys)
+            draw_triangle(start, corner, end, t, size, keys)
         else:
-            draw_triangle(projected[i], on_near_plane(q, p, view), from_p, t, size, keys)
+            draw_triangle(start, on_near_plane(q, p, view), end, t, size, keys)
 
 
 @wp.func
@@ -354,7 +377,7 @@ def in_shadow_map(view: View, point: wp.vec3, bias: float) -> wp.vec3:
     p = wp.transpose(view.axes) * (point - view.eye)
     half = 0.5 * float(view.size)
     if view.ortho == 1:
-        inverse = 1.0e-3 * (1.0e3 + p[2] + bias)
+        inverse = in_line(p[2] + bias)
         return wp.vec3(half + view.focal * p[0], half - view.focal * p[1], inverse)
     depth = -p[2]
     if depth - bias <= view.near:
@@ -427,25 +450,6 @@ def reflect_light(
             strength = fall * material.specular * wp.pow(glance, material.shininess)
             color += strength * light.specular
     return color
-
-
-@wp.struct
-class Surfaces:
-    """What can be hit: triangles with their corners' normals and texture coordinates, and planes."""
-
-    geoms: wp.array(dtype=int)  # of each vertex, an index into `materials`
-    triangles: wp.array(dtype=wp.vec3i)
-    normals: wp.array(dtype=wp.vec3)
-    normal_of: wp.array(dtype=wp.vec3i)
-    coordinates: wp.array(dtype=wp.vec2)
-    coordinate_of: wp.array(dtype=wp.vec3i)
-    density: wp.array(dtype=float)  # of each triangle, texels per metre
-    planes: wp.array(dtype=int)  # which of the drawn geoms are planes
-    plane_sizes: wp.array(dtype=wp.vec2)  # half of each edge, m; infinite if not above 0
-    materials: wp.array(dtype=Material)
-    texels: wp.array(dtype=wp.vec3)
-    levels: wp.array(dtype=Level)
-    sky: int  # the level with the sky's cube map, -1 without
 
 
 @wp.func
@@ -568,7 +572,7 @@ def color_of_triangle(
     views: wp.array(dtype=View),
     lights: wp.array(dtype=Light),
     maps: wp.array3d(dtype=wp.float32),
-    projected: wp.array(dtype=wp.vec3),
+    projected: wp.array2d(dtype=wp.vec3),
     rotations: wp.array2d(dtype=wp.mat33),
     t: int,
     x: float,
@@ -579,11 +583,11 @@ def color_of_triangle(
 ) -> wp.vec3:
     camera = views[0]
     corners = surfaces.triangles[t]
-    g = surfaces.geoms[corners[0]]
+    g = surfaces.geom_of[t]
     material = surfaces.materials[g]
-    a = projected[corners[0]]
-    b = projected[corners[1]]
-    c = projected[corners[2]]
+    a = projected[0, corners[0]]
+    b = projected[0, corners[1]]
+    c = projected[0, corners[2]]
     share = wp.vec3(1.0, 0.0, 0.0)  # of a clipped triangle: its first corner's
     if a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0:
         u = ((b[0] - x) * (c[1] - y) - (c[0] - x) * (b[1] - y)) * a[2]
@@ -633,7 +637,7 @@ def shade(
     lights: wp.array(dtype=Light),
     maps: wp.array3d(dtype=wp.float32),
     rotations: wp.array2d(dtype=wp.mat33),
-    projected: wp.array(dtype=wp.vec3),
+    projected: wp.array2d(dtype=wp.vec3),
     keys: wp.array(dtype=wp.uint64),
     behind: wp.array(dtype=Background),
     shadowed: wp.array2d(dtype=Shadowed),
@@ -654,16 +658,14 @@ def shade(
         key = keys[i]
         inverse = wp.cast(wp.uint32(key >> wp.uint64(32)), float)
         if key == wp.uint64(0) or behind[i].inverse > inverse:
-            surface = behind[i].geom
-            if surface != last:
-                color = behind[i].color
-                if surface >= 0:
-                    for n in range(maps.shape[0]):
-                        color += lit_share(maps, n, shadowed[n, i].where) * shadowed[n, i].color
-                last = surface
+            color = behind[i].color
+            if behind[i].geom >= 0:
+                for n in range(maps.shape[0]):
+                    color += lit_share(maps, n, shadowed[n, i].where) * shadowed[n, i].color
+            last = int(-3)
         else:
             triangle = int(key & wp.uint64(0xFFFFFFFF)) - 1
-            surface = surfaces.geoms[surfaces.triangles[triangle][0]]
+            surface = surfaces.geom_of[triangle]
             if surface != last:
                 color = color_of_triangle(
                     surfaces,
@@ -685,3 +687,27 @@ def shade(
     scale = 255.0 / float(samples * samples)
     for n in range(3):
         colors[row, column, n] = wp.uint8(total[n] * scale + 0.5)
+
+
+@wp.kernel
+def measure(
+    surfaces: Surfaces,
+    keys: wp.array(dtype=wp.uint64),
+    behind: wp.array(dtype=Background),
+    samples: int,
+    depth: wp.array2d(dtype=float),
+    geom: wp.array2d(dtype=int),
+):
+    """Depth and geom of each pixel's first sample."""
+    row, column = wp.tid()
+    i = (row * depth.shape[1] * samples + column) * samples
+    key = keys[i]
+    inverse = wp.cast(wp.uint32(key >> wp.uint64(32)), float)
+    found = int(-1)
+    if key == wp.uint64(0) or behind[i].inverse > inverse:
+        inverse = behind[i].inverse
+        found = behind[i].geom
+    else:
+        found = surfaces.geom_of[int(key & wp.uint64(0xFFFFFFFF)) - 1]
+    depth[row, column] = wp.where(inverse > 0.0, 1.0 / inverse, wp.inf)
+    geom[row, column] = wp.where(found >= 0, surfaces.drawn[wp.max(found, 0)], -1)

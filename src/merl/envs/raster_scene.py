@@ -29,7 +29,7 @@ class Light:
     cutoff: float
     exponent: float
     directional: bool
-    casts: bool
+    casts_shadow: bool
 
 
 @dataclass
@@ -54,7 +54,8 @@ class Scene:
     planes: Any = field(default_factory=list)
     plane_sizes: Any = field(default_factory=list)
     vertices: Any = field(default_factory=list)
-    geom_of: Any = field(default_factory=list)
+    geom_of_vertex: Any = field(default_factory=list)
+    geom_of: Any = None
     triangles: Any = field(default_factory=list)
     normals: Any = field(default_factory=list)
     normal_of: Any = field(default_factory=list)
@@ -91,7 +92,7 @@ def build_scene(model: Any) -> Scene:
     counts = {"vertices": 0, "normals": 0, "coordinates": 0}
     parts: dict[str, list[NDArray[Any]]] = {
         name: []
-        for name in ("vertices", "geom_of", "triangles", "normals", "normal_of", "coordinates", "coordinate_of", "density")
+        for name in ("vertices", "geom_of_vertex", "triangles", "normals", "normal_of", "coordinates", "coordinate_of", "density")
     }
     for geom in range(model.ngeom):
         rgba = _color(model, geom)
@@ -118,7 +119,7 @@ def build_scene(model: Any) -> Scene:
             material.texture = -1
             material.color = material.color * model_mean(model, texture)
         parts["vertices"].append(shape.vertices)
-        parts["geom_of"].append(np.full(len(shape.vertices), number))
+        parts["geom_of_vertex"].append(np.full(len(shape.vertices), number))
         parts["triangles"].append(shape.triangles + counts["vertices"])
         parts["normals"].append(shape.normals)
         parts["normal_of"].append(shape.normal_of + counts["normals"])
@@ -140,6 +141,7 @@ def build_scene(model: Any) -> Scene:
         width = {"vertices": 3, "triangles": 3, "normals": 3, "normal_of": 3, "coordinates": 2, "coordinate_of": 3}
         empty = np.zeros((0, width[name]) if name in width else (0,))
         setattr(scene, name, np.concatenate([empty, *arrays]).astype(kind_))
+    scene.geom_of = scene.geom_of_vertex[scene.triangles[:, 0]]
     a, b, c = (scene.vertices[scene.triangles[:, n]] for n in range(3))
     normal = np.cross(b - a, c - a)
     scene.facing = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1).astype(np.float32)

@@ -1,272 +1,276 @@
-"""Pictures by a z-buffer with a shadow map: `renderer="raster"`, without OpenGL."""
+"""Images by a z-buffer and shadow maps: `renderer="raster"`, which needs no OpenGL."""
 
 from __future__ import annotations
 
-import importlib
+from dataclasses import asdict
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.core import MerlError
 from merl.envs.raster_scene import Scene, build_scene
-from merl.envs.ray_tracing import _start_warp
+from merl.envs.ray_tracing import start_warp, told_if_it_takes_long
 
-SHADOW_SIZE = 192
-"""Texels along an edge of a shadow map."""
+SHADOW_TEXELS = 1.5
+"""Texels along an edge of a shadow map for each pixel along an edge of the image."""
+SHADOW_BIAS = 0.003
+"""How far a surface is moved towards a light before it is compared with the shadow map, so that it
+does not shadow itself, as a share of the model's extent."""
+INVISIBLE = 1e-3
+"""A highlight is left out where its strength falls below this share."""
 
 
 class RasterRenderer:
-    """Draw a MuJoCo model with triangles.
+    """Draw a MuJoCo model with triangles on one thread.
+
+    What a picture needs and does not change (triangles, materials, textures) is collected once;
+    planes and sky are painted again only when they, the camera or a light have moved.
 
     Args:
-        physics: a `dm_control.mjcf.Physics`; its model stays as it is.
+        physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
         camera: the name of a camera in the model.
-        size: height and width of the pictures, in pixels.
-        samples: samples along each edge of a pixel; 2 smooths edges.
+        size: height and width of the images, in pixels.
+        samples: samples along each edge of a pixel; 2 smooths edges and takes half as long again.
+        device: Warp's name of the device that draws.
+
+    Raises:
+        MerlError: the model has a geom that cannot be drawn.
     """
 
-    def __init__(self, physics: Any, camera: str, size: int, samples: int = 1) -> None:
-        _start_warp()
-        import warp as wp
+    def __init__(
+        self, physics: Any, camera: str, size: int, samples: int = 1, device: str = "cpu"
+    ) -> None:
+        start_warp()
+        self._wp, self._kernels = import_module("warp"), import_module("merl.envs.raster_kernels")
+        self._model, self._data = physics.model.ptr, physics.data.ptr
+        self._camera = self._model.camera(camera).id
+        self._samples, self._side, self._device = samples, size * samples, device
+        self._shadow_side = round(SHADOW_TEXELS * size)
+        self._scene = build_scene(self._model)
+        self._planes = np.array([self._scene.drawn[n] for n in self._scene.planes], int)
+        self._shadows = [n for n, light in enumerate(self._scene.lights) if light.casts_shadow]
+        self._still: tuple[bytes, ...] = ()
+        self._allocate(size)
+        self._describe_views()
+        with told_if_it_takes_long():
+            self._commands = self._record()
+            self.render()
 
-        k = importlib.import_module("merl.envs.raster_kernels")
-        self._k, self._wp = k, wp
-        model, self._data = physics.model.ptr, physics.data.ptr
-        self._model = model
-        self._camera = model.camera(camera).id
-        scene = build_scene(model)
-        device = "cpu"
-        self._scene = scene
-        self._planes = np.array([scene.drawn[n] for n in scene.planes], int)
+    def render(self) -> NDArray[np.uint8]:
+        """See `rendering.Renderer`."""
+        self._draw()
+        self._commands["shade"].launch()
+        image: NDArray[np.uint8] = self._colors.numpy().copy()
+        return image
 
-        def array(values: NDArray[Any], dtype: Any) -> Any:
-            return wp.array(values, dtype=dtype, device=device)
+    def render_depth(self) -> NDArray[np.float32]:
+        """Distance along the camera's axis, (size, size), m; infinite where nothing is hit."""
+        self._draw()
+        self._commands["measure"].launch()
+        depth: NDArray[np.float32] = self._depth.numpy().copy()
+        return depth
 
-        self._vertices = array(scene.vertices, wp.vec3)
-        self._geoms = array(scene.geom_of, int)
-        self._triangles = array(scene.triangles, wp.vec3i)
-        self._which = array(scene.drawn, int)
-        self._positions = wp.zeros(model.ngeom, dtype=wp.vec3, device=device)
-        self._rotations = wp.zeros(model.ngeom, dtype=wp.mat33, device=device)
-        self._shadows = [n for n in range(len(scene.lights)) if scene.lights[n].casts]
-        views = 1 + len(self._shadows)
-        drawn = len(scene.drawn)
-        self._pose = wp.zeros((views, drawn), dtype=wp.mat33, device=device)
-        self._offset = wp.zeros((views, drawn), dtype=wp.vec3, device=device)
-        self._projected = wp.zeros(len(scene.vertices), dtype=wp.vec3, device=device)
-        self._from_light = wp.zeros(len(scene.vertices), dtype=wp.vec3, device=device)
-        side = self._views_size = size * samples
-        self._keys = wp.zeros(side * side, dtype=wp.uint64, device=device)
-        texels = SHADOW_SIZE * SHADOW_SIZE
-        self._maps = wp.zeros((len(self._shadows), SHADOW_SIZE, SHADOW_SIZE), dtype=wp.float32, device=device)
-        self._flat_maps = self._maps.reshape(-1)
-        self._behind = wp.zeros(side * side, dtype=k.Background, device=device)
-        self._shadowed = wp.zeros((len(self._shadows), side * side), dtype=k.Shadowed, device=device)
-        self._still: Any = None
-        self._colors = wp.zeros((size, size, 3), dtype=wp.uint8, device=device)
-        self._views = wp.zeros(views, dtype=k.View, device=device)
-        self._lights = wp.zeros(len(scene.lights), dtype=k.Light, device=device)
+    def render_segmentation(self) -> NDArray[np.int32]:
+        """The geom that each pixel shows, (size, size); -1 for the sky."""
+        self._draw()
+        self._commands["measure"].launch()
+        geoms: NDArray[np.int32] = self._geom.numpy().copy()
+        return geoms
+
+    def close(self) -> None:
+        """Nothing to do: the arrays go with the renderer."""
+
+    def _allocate(self, size: int) -> None:
+        k, scene = self._kernels, self._scene
+        views, pixels, shadows = 1 + len(self._shadows), self._side**2, len(self._shadows)
+        wp = self._wp
+        shapes: dict[str, tuple[Any, Any]] = {
+            "positions": (self._model.ngeom, wp.vec3),
+            "rotations": (self._model.ngeom, wp.mat33),
+            "views": (views, k.View),
+            "lights": (len(scene.lights), k.Light),
+            "pose": ((views, len(scene.drawn)), wp.mat33),
+            "offset": ((views, len(scene.drawn)), wp.vec3),
+            "eyes": ((views, len(scene.drawn)), wp.vec4),
+            "projected": ((views, len(scene.vertices)), wp.vec3),
+            "keys": (pixels, wp.uint64),
+            "maps": ((shadows, self._shadow_side, self._shadow_side), float),
+            "behind": (pixels, k.Background),
+            "shadowed": ((shadows, pixels), k.Shadowed),
+            "colors": ((size, size, 3), wp.uint8),
+            "depth": ((size, size), float),
+            "geom": ((size, size), int),
+        }
+        for name, (shape, dtype) in shapes.items():
+            setattr(self, f"_{name}", wp.zeros(shape, dtype=dtype, device=self._device))
+        self._surfaces = self._fill_surfaces(scene)
+
+    def _array(self, values: NDArray[Any], dtype: Any) -> Any:
+        return self._wp.array(values, dtype=dtype, device=self._device)
+
+    def _fill_surfaces(self, scene: Scene) -> Any:
+        wp, k = self._wp, self._kernels
         surfaces = k.Surfaces()
-        surfaces.geoms, surfaces.triangles = self._geoms, self._triangles
-        surfaces.normals = array(scene.normals, wp.vec3)
-        surfaces.normal_of = array(scene.normal_of, wp.vec3i)
-        surfaces.coordinates = array(scene.coordinates, wp.vec2)
-        surfaces.coordinate_of = array(scene.coordinate_of, wp.vec3i)
-        surfaces.density = array(scene.density, float)
-        surfaces.planes = array(scene.planes, int)
-        surfaces.plane_sizes = array(scene.plane_sizes, wp.vec2)
-        surfaces.texels = array(scene.texels, wp.vec3)
+        vec3, vec3i = wp.vec3, wp.vec3i
+        for name, dtype in {
+            "drawn": int,
+            "vertices": vec3,
+            "geom_of_vertex": int,
+            "triangles": vec3i,
+            "geom_of": int,
+            "facing": wp.vec4,
+            "normals": vec3,
+            "normal_of": vec3i,
+            "coordinates": wp.vec2,
+            "coordinate_of": vec3i,
+            "density": float,
+            "planes": int,
+            "plane_sizes": wp.vec2,
+            "texels": vec3,
+        }.items():
+            setattr(surfaces, name, self._array(getattr(scene, name), dtype))
         surfaces.sky = scene.sky
-        materials = wp.zeros(drawn, dtype=k.Material, device=device)
-        fill = materials.numpy()
-        for n, m in enumerate(scene.materials):
-            fill[n]["color"] = m.color
-            fill[n]["emission"] = m.emission
-            fill[n]["specular"] = m.specular
-            fill[n]["shininess"] = m.shininess
-            fill[n]["dull"] = 1e-3 ** (1 / max(m.shininess, 1e-3))
-            fill[n]["texture"] = m.texture
-            fill[n]["levels"] = m.levels
-            fill[n]["repeat"] = m.repeat
-        surfaces.materials = materials
-        levels = wp.zeros(max(1, len(scene.levels)), dtype=k.Level, device=device)
-        for n, (start, width, height) in enumerate(scene.levels):
-            levels.numpy()[n] = (start, width, height)
-        surfaces.levels = levels
-        self._surfaces = surfaces
-        self._fill_lights(scene)
-        view = self._views.numpy()[0:1]
-        view["focal"] = 0.5 * side / np.tan(np.radians(model.cam_fovy[self._camera]) / 2)
-        view["size"], view["near"] = side, model.vis.map.znear * model.stat.extent
-        for n, index in enumerate(self._shadows):
-            light = self._views.numpy()[1 + n : 2 + n]
-            light["size"], light["near"] = SHADOW_SIZE, model.vis.map.znear * model.stat.extent
-            directional = scene.lights[index].directional
-            light["ortho"] = directional
-            if directional:
-                light["focal"] = 0.5 * SHADOW_SIZE / (model.vis.map.shadowclip * model.stat.extent)
-            else:
-                angle = np.radians(model.light_cutoff[scene.lights[index].index]) * model.vis.map.shadowscale
-                light["focal"] = 0.5 * SHADOW_SIZE / np.tan(angle)
-        self._bias = 0.003 * model.stat.extent
-        self._eye = wp.zeros((views, drawn), dtype=wp.vec4, device=device)
-        self._facing = array(scene.facing, wp.vec4)
-        self._geom_of = array(scene.geom_of[scene.triangles[:, 0]], int)
-        self._commands = self._record(samples)
-        self._np = {n: getattr(self, n).numpy() for n in ("_positions","_rotations","_views","_lights","_keys","_maps","_colors")}
-        self._view_fields = {n: self._np["_views"][n] for n in ("eye","axes")}
-        self._light_fields = {n: self._np["_lights"][n] for n in ("position","direction")}
+        materials = np.zeros(len(scene.materials), k.Material.numpy_dtype())
+        for row, material in zip(materials, scene.materials, strict=True):
+            for name, value in asdict(material).items():
+                row[name] = value
+            row["dull"] = INVISIBLE ** (1 / max(material.shininess, INVISIBLE))
+        surfaces.materials = self._array(materials, k.Material)
+        levels = np.array(scene.levels or [(0, 1, 1)], np.int32)
+        surfaces.levels = self._array(levels.view(k.Level.numpy_dtype()).reshape(-1), k.Level)
+        return surfaces
 
-    def _fill_lights(self, scene: Scene) -> None:
-        fill = self._lights.numpy()
-        shadow = 0
-        for n, light in enumerate(scene.lights):
-            for name in ("ambient", "diffuse", "specular", "attenuation", "cutoff", "exponent", "directional"):
-                fill[n][name] = getattr(light, name)
-            fill[n]["shadow"] = -1
-            fill[n]["shiny"] = bool(np.any(light.specular > 0))
-            if light.casts:
-                fill[n]["shadow"] = shadow
-                shadow += 1
+    def _describe_views(self) -> None:
+        """What does not move of the camera and the lights; `_aim` sets the rest."""
+        model, k = self._model, self._kernels
+        near = model.vis.map.znear * model.stat.extent
+        self._view_rows = np.zeros(1 + len(self._shadows), k.View.numpy_dtype())
+        self._light_rows = np.zeros(len(self._scene.lights), k.Light.numpy_dtype())
+        views = self._view_rows
+        views["near"], views["size"] = near, self._shadow_side
+        views["size"][0] = self._side
+        half = np.tan(np.radians(model.cam_fovy[self._camera]) / 2)
+        views["focal"][0] = 0.5 * self._side / half
+        for n, light in enumerate(self._scene.lights):
+            row = self._light_rows[n : n + 1]
+            for name in ("ambient", "diffuse", "specular", "attenuation", "cutoff", "exponent"):
+                row[name] = getattr(light, name)
+            row["directional"], row["shiny"] = light.directional, np.any(light.specular > 0)
+            row["shadow"] = self._shadows.index(n) if light.casts_shadow else -1
+            if light.casts_shadow:
+                view = views[1 + self._shadows.index(n) :][:1]
+                view["ortho"] = light.directional
+                reach = model.vis.map.shadowclip * model.stat.extent
+                if not light.directional:
+                    angle = model.light_cutoff[light.index] * model.vis.map.shadowscale
+                    reach = np.tan(np.radians(angle))
+                view["focal"] = 0.5 * self._shadow_side / reach
 
-    def _record(self, samples: int) -> list[Any]:
-        wp, k = self._wp, self._k
-        count, triangles = len(self._scene.vertices), len(self._scene.triangles)
+    def _record(self) -> dict[str, Any]:
+        """Every launch, recorded once: replaying one takes microseconds."""
+        k, wp = self._kernels, self._wp
+        scene, surfaces = self._scene, self._surfaces
+        frames = [self._views, self._pose, self._offset]
 
-        def launch(kernel: Any, dim: Any, inputs: list[Any]) -> Any:
-            return wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_cmd=True)
+        def launch(kernel: Any, dim: Any, *inputs: Any) -> Any:
+            return wp.launch(
+                kernel, dim=dim, inputs=list(inputs), device=self._device, record_cmd=True
+            )
 
-        views = self._views.shape[0]
-        commands = [
-            launch(
+        views, vertices = 1 + len(self._shadows), len(scene.vertices)
+        commands = {
+            "place": launch(
                 k.place_geoms,
-                (views, len(self._scene.drawn)),
-                [self._views, self._positions, self._rotations, self._which, self._pose, self._offset, self._eye],
-            )
-        ]
-        size = SHADOW_SIZE * SHADOW_SIZE
-        for v in range(views):
-            projected = self._projected if v == 0 else self._from_light
-            keys = self._keys if v == 0 else self._flat_maps[(v - 1) * size : v * size]
-            commands.append(
-                launch(
-                    k.project,
-                    count,
-                    [self._views, self._pose, self._offset, self._vertices, self._geoms, v, projected],
-                )
-            )
-            commands.append(
-                launch(
-                    k.cover,
-                    triangles,
-                    [
-                        self._views,
-                        self._pose,
-                        self._offset,
-                        self._vertices,
-                        self._geoms,
-                        self._triangles,
-                        projected,
-                        self._facing,
-                        self._geom_of,
-                        self._eye,
-                        v,
-                        keys,
-                    ],
-                )
-            )
-        commands.append(
-            launch(
+                (views, len(scene.drawn)),
+                *(surfaces, self._views, self._positions, self._rotations),
+                *(self._pose, self._offset, self._eyes),
+            ),
+            "paint": launch(
+                k.paint_background,
+                (self._side, self._side),
+                *(surfaces, self._views, self._lights, self._pose, self._offset),
+                *(self._samples, self._behind, self._shadowed),
+            ),
+            "project": launch(
+                k.project, (views, vertices), surfaces, *frames, self._projected
+            ),
+            "cover": launch(
+                k.cover,
+                len(scene.triangles),
+                *(surfaces, *frames, self._eyes, self._projected, 0, self._keys),
+            ),
+            "shade": launch(
                 k.shade,
                 self._colors.shape[:2],
-                [
-                    self._surfaces,
-                    self._views,
-                    self._lights,
-                    self._maps,
-                    self._pose,
-                    self._projected,
-                    self._keys,
-                    self._behind,
-                    self._shadowed,
-                    samples,
-                    self._bias,
-                    self._colors,
-                ],
+                *(surfaces, self._views, self._lights, self._maps, self._pose, self._projected),
+                *(self._keys, self._behind, self._shadowed, self._samples),
+                *(SHADOW_BIAS * self._model.stat.extent, self._colors),
+            ),
+            "measure": launch(
+                k.measure,
+                self._depth.shape,
+                *(surfaces, self._keys, self._behind, self._samples, self._depth, self._geom),
+            ),
+        }
+        for n in range(len(self._shadows)):
+            commands[f"shadow {n}"] = launch(
+                k.cover,
+                len(scene.triangles),
+                *(surfaces, *frames, self._eyes, self._projected, 1 + n),
+                self._maps[n].reshape(-1),
             )
-        )
-        self._paint = launch(
-            k.paint_background,
-            (self._views_size, self._views_size),
-            [
-                self._surfaces,
-                self._views,
-                self._lights,
-                self._pose,
-                self._offset,
-                samples,
-                self._behind,
-                self._shadowed,
-            ],
-        )
         return commands
 
-    def _update(self) -> None:
+    def _draw(self) -> None:
+        """Everything but the colours: poses, background, z-buffer, shadow maps."""
         data = self._data
-        planes = self._planes
+        self._positions.assign(data.geom_xpos)
+        self._rotations.assign(data.geom_xmat.reshape(-1, 3, 3))
         still = (
             data.cam_xpos[self._camera].tobytes(),
             data.cam_xmat[self._camera].tobytes(),
             data.light_xpos.tobytes(),
             data.light_xdir.tobytes(),
-            data.geom_xpos[planes].tobytes(),
-            data.geom_xmat[planes].tobytes(),
+            data.geom_xpos[self._planes].tobytes(),
+            data.geom_xmat[self._planes].tobytes(),
         )
-        self._moved = still != self._still
-        self._still = still
-        self._np["_positions"][:] = data.geom_xpos
-        self._np["_rotations"][:] = data.geom_xmat.reshape(-1, 3, 3)
-        self._np["_keys"].fill(0)
-        self._np["_maps"].fill(0)
-        if not self._moved:
-            return
-        views, lights = self._view_fields, self._light_fields
+        moved = still != self._still
+        if moved:
+            self._aim()
+        self._commands["place"].launch()
+        if moved:
+            self._commands["paint"].launch()
+            self._still = still
+        self._keys.zero_()
+        self._maps.zero_()
+        self._commands["project"].launch()
+        self._commands["cover"].launch()
+        for n in range(len(self._shadows)):
+            self._commands[f"shadow {n}"].launch()
+
+    def _aim(self) -> None:
+        """Where the camera and the lights are, and which way they look."""
+        data, views, lights = self._data, self._view_rows, self._light_rows
         views["eye"][0] = data.cam_xpos[self._camera]
         views["axes"][0] = data.cam_xmat[self._camera].reshape(3, 3)
-        shadow = 1
         for n, light in enumerate(self._scene.lights):
-            if light.index < 0:
-                lights["position"][n] = data.cam_xpos[self._camera]
-                lights["direction"][n] = -data.cam_xmat[self._camera].reshape(3, 3)[:, 2]
-            else:
-                lights["position"][n] = data.light_xpos[light.index]
-                lights["direction"][n] = data.light_xdir[light.index]
-            if light.casts:
-                views["eye"][shadow] = lights["position"][n]
-                views["axes"][shadow] = _axes(lights["direction"][n])
-                shadow += 1
-
-    def render(self) -> NDArray[np.uint8]:
-        """See `rendering.Renderer`."""
-        self._update()
-        place, *others = self._commands
-        place.launch()
-        if self._moved:
-            self._paint.launch()
-        for command in others:
-            command.launch()
-        picture: NDArray[np.uint8] = self._np["_colors"].copy()
-        return picture
-
-    def close(self) -> None:
-        """Nothing to do: the arrays go with the renderer."""
+            head = light.index < 0
+            lights["position"][n] = views["eye"][0] if head else data.light_xpos[light.index]
+            lights["direction"][n] = (
+                -views["axes"][0][:, 2] if head else data.light_xdir[light.index]
+            )
+        for n, index in enumerate(self._shadows):
+            views["eye"][1 + n] = lights["position"][index]
+            views["axes"][1 + n] = _axes(lights["direction"][index])
+        self._views.assign(views)
+        self._lights.assign(lights)
 
 
 def _axes(direction: NDArray[Any]) -> NDArray[Any]:
     """Axes (columns: right, up, backward) of a view that looks in a direction."""
     back = -direction / np.linalg.norm(direction)
-    helper = np.array([0.0, 1.0, 0.0]) if abs(back[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
+    helper = (0.0, 1.0, 0.0) if abs(back[2]) > 0.9 else (0.0, 0.0, 1.0)
     right = np.cross(helper, back)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(back, right), back], axis=1)

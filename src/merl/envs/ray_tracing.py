@@ -30,10 +30,10 @@ class WarpRenderer:
     """
 
     def __init__(self, physics: Any, camera: str, size: int) -> None:
-        self._mjw = _start_warp()
+        self._mjw = start_warp()
         self._source = physics.data.ptr
         model = physics.model.ptr
-        with _warp_on_cpu(), _told_if_it_takes_long():
+        with _warp_on_cpu(), told_if_it_takes_long():
             self._model = self._mjw.put_model(model)
             self._data = self._mjw.put_data(model, self._source)
             self._context = self._mjw.create_render_context(
@@ -121,7 +121,7 @@ def _warp_on_cpu() -> Iterator[None]:
         yield
 
 
-def _start_warp() -> Any:
+def start_warp() -> Any:
     """The module mujoco_warp, with Warp silenced and a place for its compiled kernels."""
     with _warp_lock:
         if "mujoco_warp" not in sys.modules:
@@ -138,11 +138,11 @@ def _start_warp() -> Any:
 
 
 @contextmanager
-def _told_if_it_takes_long(seconds: float = 2.0) -> Iterator[None]:
-    """Say that the ray tracer is being compiled: what is compiled already is there in less time."""
+def told_if_it_takes_long(seconds: float = 2.0) -> Iterator[None]:
+    """Say that the renderer is being compiled; loading what is compiled takes less time."""
     notice = threading.Timer(
         seconds,
-        lambda: print("merl: compiling the ray tracer, once, for 5 to 20 s", file=sys.stderr),
+        lambda: print("merl: compiling the renderer, once, for 5 to 20 s", file=sys.stderr),
     )
     notice.daemon = True
     notice.start()

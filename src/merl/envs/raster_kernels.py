@@ -14,7 +14,8 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-BACKGROUND = wp.constant(-1)
+SHADOW_OFFSET = wp.constant(1.5)
+"""How far a surface is lifted for its look into a shadow map, in texels."""
 
 
 @wp.struct
@@ -372,18 +373,23 @@ class Shadowed:
 
 
 @wp.func
-def in_shadow_map(view: View, point: wp.vec3, bias: float) -> wp.vec3:
-    """A point of the world as (column, row, 1 / depth) in a light's view, `bias` metres nearer."""
-    p = wp.transpose(view.axes) * (point - view.eye)
+def in_shadow_map(view: View, point: wp.vec3, normal: wp.vec3, offset: float) -> wp.vec3:
+    """A point of the world as (column, row, 1 / depth) in a light's view.
+
+    It is lifted off its surface by `offset` texels, so that the surface does not shadow itself.
+    """
+    inverse = wp.transpose(view.axes)
+    p = inverse * (point - view.eye)
     half = 0.5 * float(view.size)
     if view.ortho == 1:
-        inverse = in_line(p[2] + bias)
-        return wp.vec3(half + view.focal * p[0], half - view.focal * p[1], inverse)
-    depth = -p[2]
-    if depth - bias <= view.near:
+        p += (offset / view.focal) * (inverse * normal)
+        return wp.vec3(half + view.focal * p[0], half - view.focal * p[1], in_line(p[2]))
+    p -= (p[2] * offset / view.focal) * (inverse * normal)
+    if -p[2] <= view.near:
         return wp.vec3(-1.0, -1.0, 1.0)  # outside of the map: lit
+    scale = -1.0 / p[2]
     return wp.vec3(
-        half + view.focal * p[0] / depth, half - view.focal * p[1] / depth, 1.0 / (depth - bias)
+        half + view.focal * p[0] * scale, half - view.focal * p[1] * scale, scale
     )
 
 
@@ -560,7 +566,7 @@ def paint_background(
             else:
                 cast = Shadowed()
                 cast.color = reflected
-                cast.where = in_shadow_map(views[1 + light.shadow], point, 0.0)
+                cast.where = in_shadow_map(views[1 + light.shadow], point, normal, 0.0)
                 shadowed[light.shadow, i] = cast
         found.color = color
     behind[i] = found
@@ -579,7 +585,6 @@ def color_of_triangle(
     y: float,
     inverse: float,
     samples: float,
-    bias: float,
 ) -> wp.vec3:
     camera = views[0]
     corners = surfaces.triangles[t]
@@ -624,7 +629,7 @@ def color_of_triangle(
         fall = reach_of(light, point)
         reflected = reflect_light(light, fall, material, base, point, normal, viewer)
         if light.shadow >= 0 and reflected[0] + reflected[1] + reflected[2] > 0.0:
-            spot = in_shadow_map(views[1 + light.shadow], point, bias)
+            spot = in_shadow_map(views[1 + light.shadow], point, normal, SHADOW_OFFSET)
             reflected = lit_share(maps, light.shadow, spot) * reflected
         color += fall * wp.cw_mul(light.ambient, base) + reflected
     return color
@@ -642,7 +647,6 @@ def shade(
     behind: wp.array(dtype=Background),
     shadowed: wp.array2d(dtype=Shadowed),
     samples: int,
-    bias: float,
     colors: wp.array3d(dtype=wp.uint8),
 ):
     """Colour each pixel: the mean of its samples x samples, shading each surface in it once."""
@@ -679,7 +683,6 @@ def shade(
                     float(j) + 0.5,
                     inverse,
                     float(samples),
-                    bias,
                 )
                 last = surface
         for n in range(3):

@@ -14,9 +14,6 @@ from merl.envs.ray_tracing import start_warp, told_if_it_takes_long
 
 SHADOW_TEXELS = 1.5
 """Texels along an edge of a shadow map for each pixel along an edge of the image."""
-SHADOW_BIAS = 0.003
-"""How far a surface is moved towards a light before it is compared with the shadow map, so that it
-does not shadow itself, as a share of the model's extent."""
 INVISIBLE = 1e-3
 """A highlight is left out where its strength falls below this share."""
 
@@ -204,8 +201,7 @@ class RasterRenderer:
                 k.shade,
                 self._colors.shape[:2],
                 *(surfaces, self._views, self._lights, self._maps, self._pose, self._projected),
-                *(self._keys, self._behind, self._shadowed, self._samples),
-                *(SHADOW_BIAS * self._model.stat.extent, self._colors),
+                *(self._keys, self._behind, self._shadowed, self._samples, self._colors),
             ),
             "measure": launch(
                 k.measure,

@@ -1,0 +1,188 @@
+"""The rasteriser against OpenGL and against MuJoCo's own rays, on the tasks and on every geom type."""
+
+import mujoco
+import numpy as np
+import pytest
+from dm_control import mujoco as dm_mujoco
+
+from merl.core import MerlError
+from merl.envs import make_env
+from merl.envs.rasterizer import RasterRenderer
+from merl.envs.rendering import check_renderer
+from merl.tasks import TASKS
+from merl.tasks.jaco import CAMERA
+
+EVERY_GEOM = """
+<mujoco>
+  <visual><map znear="0.05"/></visual>
+  <asset>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1="0.3 0.5 0.7" rgb2="0 0 0" width="64"
+      height="64"/>
+    <texture name="checks" type="2d" builtin="checker" rgb1="0.2 0.3 0.4" rgb2="0.6 0.7 0.8"
+      width="64" height="64"/>
+    <material name="checks" texture="checks" texrepeat="2 2" texuniform="true" specular="0"/>
+    <material name="shiny" rgba="0.2 0.6 0.3 1" specular="1" shininess="0.8"/>
+    <material name="glowing" rgba="0.8 0.2 0.2 1" emission="0.4"/>
+    <mesh name="pyramid" vertex="-0.2 -0.2 0  0.2 -0.2 0  0.2 0.2 0  -0.2 0.2 0  0 0 0.4"/>
+  </asset>
+  <worldbody>
+    <light pos="0.5 -0.5 2.5" dir="-0.2 0.2 -1" directional="true" diffuse="0.4 0.4 0.4"/>
+    <light pos="-1 -1 2" dir="0.4 0.4 -0.8" cutoff="50" diffuse="0.5 0.5 0.4"/>
+    <camera name="view" pos="0 -2.6 1.3" xyaxes="1 0 0 0 0.42 0.9"/>
+    <camera name="inside" pos="0 -0.9 0.15" xyaxes="1 0 0 0 0.2 1"/>
+    <geom type="plane" size="2 2 0.1" material="checks"/>
+    <geom type="box" pos="-0.9 0 0.2" size="0.2 0.15 0.2" euler="0 0 30" rgba="0.7 0.2 0.1 1"/>
+    <geom type="sphere" pos="-0.45 0 0.2" size="0.2" material="shiny"/>
+    <geom type="capsule" pos="0 0 0.35" size="0.1 0.2" euler="20 0 0" rgba="0.2 0.2 0.7 1"/>
+    <geom type="cylinder" pos="0.4 0 0.2" size="0.15 0.2" euler="0 20 0" rgba="0.7 0.7 0.1 1"/>
+    <geom type="ellipsoid" pos="0.8 0 0.2" size="0.2 0.1 0.2" material="glowing"/>
+    <geom type="mesh" mesh="pyramid" pos="0 0.6 0" rgba="0.5 0.1 0.6 1"/>
+    <geom type="box" pos="0 -0.7 0.02" size="1 0.4 0.02" rgba="0.4 0.5 0.4 1"/>
+    <geom type="box" pos="0 1 0.5" size="0.3 0.1 0.5" rgba="1 1 1 0"/>
+    <geom type="sphere" pos="0 -1 0.5" size="0.3" group="3"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def opengl():
+    try:
+        check_renderer("gl")
+    except MerlError:
+        pytest.skip("no OpenGL library works on this machine")
+
+
+@pytest.fixture(scope="module")
+def every_geom():
+    physics = dm_mujoco.Physics.from_xml_string(EVERY_GEOM)
+    physics.forward()
+    yield physics
+    physics.free()
+
+
+@pytest.fixture(params=TASKS)
+def task(request):
+    """A physics of each task after some random steps."""
+    env = make_env(request.param, renderer="warp", observations=("proprio",))
+    env.reset(seed=3)
+    action = np.random.default_rng(2).uniform(-1, 1, 9).astype(np.float32)
+    for _ in range(20):
+        env.step(action)
+    yield env.physics
+    env.close()
+
+
+def rays(physics, camera, size, visible=(1, 1, 1, 0, 0, 0)):
+    """Depth (m) and geom of each pixel's centre, by MuJoCo's own ray casting; inf and -1: none."""
+    model, data = physics.model.ptr, physics.data.ptr
+    number = model.camera(camera).id
+    eye, axes = data.cam_xpos[number], data.cam_xmat[number].reshape(3, 3)
+    focal = 0.5 * size / np.tan(np.radians(model.cam_fovy[number]) / 2)
+    centre = (np.arange(size) + 0.5 - size / 2) / focal
+    depth, geom = np.full((size, size), np.inf), np.full((size, size), -1)
+    found = np.zeros((1, 1), np.int32)
+    for row, y in enumerate(-centre):
+        for column, x in enumerate(centre):
+            ray = axes @ (x, y, -1.0)
+            norm = np.linalg.norm(ray)
+            groups = np.array(visible, np.uint8)
+            distance = mujoco.mj_ray(model, data, eye, ray / norm, groups, 1, -1, found)
+            if distance >= 0:
+                depth[row, column], geom[row, column] = distance / norm, found[0, 0]
+    return depth, geom
+
+
+def test_depth_and_geoms_are_those_of_mujocos_rays(every_geom):
+    renderer = RasterRenderer(every_geom, "view", 48)
+    depth, geom = rays(every_geom, "view", 48)
+    mine = renderer.render_segmentation()
+    assert set(np.unique(mine)) == {-1, *range(8)}  # every geom is seen but the two hidden ones
+    same = mine == geom
+    assert same.mean() > 0.985  # curved geoms are drawn with flat triangles
+    seen = same & (geom >= 0)
+    np.testing.assert_allclose(renderer.render_depth()[seen], depth[seen], rtol=0.01)
+    assert np.isinf(renderer.render_depth()[mine < 0]).all()
+
+
+def test_triangles_are_clipped_at_the_near_plane(every_geom):
+    """The camera stands over a box that reaches behind it: its far part is still drawn."""
+    renderer = RasterRenderer(every_geom, "inside", 48)
+    depth, geom = rays(every_geom, "inside", 48)
+    mine = renderer.render_segmentation()
+    under = 7
+    assert (geom == under).sum() > 100
+    assert ((mine == under) == (geom == under)).mean() > 0.99
+    near = (mine == under) & (geom == under)
+    np.testing.assert_allclose(renderer.render_depth()[near], depth[near], rtol=1e-3)
+
+
+@pytest.mark.usefixtures("opengl")
+def test_every_geom_has_opengls_colours(every_geom):
+    for samples, bar in ((1, 5.0), (2, 4.0)):
+        mine = RasterRenderer(every_geom, "view", 84, samples).render().astype(int)
+        theirs = every_geom.render(84, 84, camera_id="view").astype(int)
+        assert np.abs(mine - theirs).mean() < bar
+
+
+@pytest.mark.usefixtures("opengl")
+def test_tasks_look_as_opengl_draws_them(task):
+    drawn = task.render(84, 84, camera_id=CAMERA.name).astype(int)
+    labels = task.render(84, 84, camera_id=CAMERA.name, segmentation=True)
+    geoms = np.where(labels[..., 1] == mujoco.mjtObj.mjOBJ_GEOM, labels[..., 0], -1)
+    for samples in (1, 2):
+        renderer = RasterRenderer(task, CAMERA.name, 84, samples)
+        assert np.abs(renderer.render().astype(int) - drawn).mean() < 4.0
+        if samples == 1:
+            assert (renderer.render_segmentation() == geoms).mean() > 0.995
+
+
+def test_depth_of_a_task_is_exact(task):
+    renderer = RasterRenderer(task, CAMERA.name, 32)
+    depth, geom = rays(task, CAMERA.name, 32)
+    same = (renderer.render_segmentation() == geom) & (geom >= 0)
+    assert same.mean() > 0.7  # the rest is the sky
+    np.testing.assert_allclose(renderer.render_depth()[same], depth[same], rtol=5e-3)
+
+
+def test_shadows_fall_and_move(every_geom):
+    """The ball's shadow on the floor is darker than the floor beside it."""
+    renderer = RasterRenderer(every_geom, "view", 84)
+    lit = renderer.render()
+    model = every_geom.model.ptr
+    model.light_castshadow[:] = False
+    bright = RasterRenderer(every_geom, "view", 84).render()
+    model.light_castshadow[:] = True
+    darker = (bright.astype(int) - lit).sum(-1) > 30
+    assert 0.02 < darker.mean() < 0.4
+    assert (bright >= lit).all()
+
+
+def test_a_moved_camera_and_light_are_seen(every_geom):
+    renderer = RasterRenderer(every_geom, "view", 48)
+    before = renderer.render()
+    np.testing.assert_array_equal(renderer.render(), before)
+    data = every_geom.data.ptr
+    kept = data.cam_xpos.copy(), data.light_xdir.copy()
+    data.cam_xpos[0, 0] += 0.3
+    moved = renderer.render()
+    fresh = RasterRenderer(every_geom, "view", 48).render()
+    np.testing.assert_array_equal(moved, fresh)
+    data.cam_xpos[:] = kept[0]
+    data.light_xdir[1] = (0.0, 0.0, -1.0)
+    relit = renderer.render()
+    assert np.abs(relit.astype(int) - before).max() > 10
+    np.testing.assert_array_equal(relit, RasterRenderer(every_geom, "view", 48).render())
+    data.light_xdir[:] = kept[1]
+    np.testing.assert_array_equal(renderer.render(), before)
+
+
+def test_a_geom_that_cannot_be_drawn_is_named():
+    physics = dm_mujoco.Physics.from_xml_string(
+        """<mujoco><asset><hfield name="hills" nrow="2" ncol="2" size="1 1 1 1"
+        elevation="0 1 1 0"/></asset><worldbody><camera name="view"/>
+        <geom name="ground" type="hfield" hfield="hills"/></worldbody></mujoco>"""
+    )
+    with pytest.raises(MerlError, match="cannot draw geom 'ground' of type hfield"):
+        RasterRenderer(physics, "view", 32)
+    physics.free()

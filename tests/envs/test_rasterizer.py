@@ -1,4 +1,4 @@
-"""The rasteriser against OpenGL and against MuJoCo's own rays, on the tasks and on every geom type."""
+"""The rasteriser beside OpenGL and MuJoCo's own rays, on the tasks and on every geom type."""
 
 import mujoco
 import numpy as np

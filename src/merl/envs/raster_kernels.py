@@ -1,11 +1,12 @@
 """Warp kernels of the rasteriser: pose, transform, cover, shade; the same source for CPU and CUDA.
 
-A picture is made in four steps: `place_geoms` and `project` bring every vertex into the camera's (or a
-light's) frame, `cover` writes for each sample the nearest triangle, `shade` colours each pixel.
-Planes have no triangles: `shade` intersects the pixel's ray with them.
+`place_geoms` and `project` bring every vertex into the camera's or a light's frame, `cover` writes
+for each sample the nearest triangle, `shade` colours each pixel. Planes have no triangles:
+`paint_background` meets them with the ray of each sample.
 
-Conventions: a view looks along -z with +x to the right and +y up, as a MuJoCo camera does. The depth
-of a point is its distance along the viewing direction, in metres; the buffers compare 1 / depth.
+Conventions: a view looks along -z with +x to the right and +y up, as a MuJoCo camera does. The
+depth of a point is its distance along the viewing direction, in metres; the buffers compare
+1 / depth. Index 0 of what a view has is the camera's.
 """
 
 from typing import Any
@@ -303,9 +304,7 @@ def sample_texture(
     texels_per_pixel: float,
 ) -> wp.vec3:
     """Trilinear: between the two mipmap levels whose texels are about as large as a pixel."""
-    detail = wp.clamp(
-        wp.log2(wp.max(texels_per_pixel, 1.0e-6)), 0.0, float(material.levels - 1)
-    )
+    detail = wp.clamp(wp.log2(wp.max(texels_per_pixel, 1.0e-6)), 0.0, float(material.levels - 1))
     lower = int(detail)
     color = sample_level(texels, levels[material.texture + lower], u, v)
     share = detail - float(lower)
@@ -316,9 +315,7 @@ def sample_texture(
 
 
 @wp.func
-def sky(
-    texels: wp.array(dtype=wp.vec3), level: Level, direction: wp.vec3
-) -> wp.vec3:
+def sky(texels: wp.array(dtype=wp.vec3), level: Level, direction: wp.vec3) -> wp.vec3:
     """The cube map's colour in a direction of the world; its six faces lie below one another."""
     # OpenGL's cube map axes: x, z and -y of the world (OpenGL 2.1 specification, table 3.19).
     r = wp.vec3(direction[0], direction[2], -direction[1])
@@ -388,9 +385,7 @@ def in_shadow_map(view: View, point: wp.vec3, normal: wp.vec3, offset: float) ->
     if -p[2] <= view.near:
         return wp.vec3(-1.0, -1.0, 1.0)  # outside of the map: lit
     scale = -1.0 / p[2]
-    return wp.vec3(
-        half + view.focal * p[0] * scale, half - view.focal * p[1] * scale, scale
-    )
+    return wp.vec3(half + view.focal * p[0] * scale, half - view.focal * p[1] * scale, scale)
 
 
 @wp.func
@@ -460,7 +455,7 @@ def reflect_light(
 
 @wp.func
 def plane_inverse(rotation: wp.mat33, offset: wp.vec3, ray: wp.vec3) -> float:
-    """1 / depth at which a ray from the camera meets a plane from its front; 0 where it does not."""
+    """1 / depth at which a ray of the camera meets a plane from its front; 0: it does not."""
     normal = wp.vec3(rotation[0, 2], rotation[1, 2], rotation[2, 2])
     height = wp.dot(normal, offset)
     if height >= 0.0:  # the camera is below it

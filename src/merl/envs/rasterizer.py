@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -58,21 +59,21 @@ class RasterRenderer:
         """See `rendering.Renderer`."""
         self._draw()
         self._commands["shade"].launch()
-        image: NDArray[np.uint8] = self._colors.numpy().copy()
+        image: NDArray[np.uint8] = self._arrays.colors.numpy().copy()
         return image
 
     def render_depth(self) -> NDArray[np.float32]:
         """Distance along the camera's axis, (size, size), m; infinite where nothing is hit."""
         self._draw()
         self._commands["measure"].launch()
-        depth: NDArray[np.float32] = self._depth.numpy().copy()
+        depth: NDArray[np.float32] = self._arrays.depth.numpy().copy()
         return depth
 
     def render_segmentation(self) -> NDArray[np.int32]:
         """The geom that each pixel shows, (size, size); -1 for the sky."""
         self._draw()
         self._commands["measure"].launch()
-        geoms: NDArray[np.int32] = self._geom.numpy().copy()
+        geoms: NDArray[np.int32] = self._arrays.geom.numpy().copy()
         return geoms
 
     def close(self) -> None:
@@ -99,8 +100,11 @@ class RasterRenderer:
             "depth": ((size, size), float),
             "geom": ((size, size), int),
         }
-        for name, (shape, dtype) in shapes.items():
-            setattr(self, f"_{name}", wp.zeros(shape, dtype=dtype, device=self._device))
+        made = {
+            name: wp.zeros(shape, dtype=dtype, device=self._device)
+            for name, (shape, dtype) in shapes.items()
+        }
+        self._arrays: Any = SimpleNamespace(**made)
         self._surfaces = self._fill_surfaces(scene)
 
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
@@ -166,9 +170,9 @@ class RasterRenderer:
 
     def _record(self) -> dict[str, Any]:
         """Every launch, recorded once: replaying one takes microseconds."""
-        k, wp = self._kernels, self._wp
+        k, wp, a = self._kernels, self._wp, self._arrays
         scene, surfaces = self._scene, self._surfaces
-        frames = [self._views, self._pose, self._offset]
+        frames = [a.views, a.pose, a.offset]
 
         def launch(kernel: Any, dim: Any, *inputs: Any) -> Any:
             return wp.launch(
@@ -180,49 +184,80 @@ class RasterRenderer:
             "place": launch(
                 k.place_geoms,
                 (views, len(scene.drawn)),
-                *(surfaces, self._views, self._positions, self._rotations),
-                *(self._pose, self._offset, self._eyes),
+                *(surfaces, a.views, a.positions, a.rotations),
+                *(a.pose, a.offset, a.eyes),
             ),
             "paint": launch(
                 k.paint_background,
                 (self._side, self._side),
-                *(surfaces, self._views, self._lights, self._pose, self._offset),
-                *(self._samples, self._behind, self._shadowed),
+                *(
+                    surfaces,
+                    a.views,
+                    a.lights,
+                    a.pose,
+                    a.offset,
+                ),
+                *(self._samples, a.behind, a.shadowed),
             ),
-            "project": launch(
-                k.project, (views, vertices), surfaces, *frames, self._projected
-            ),
+            "project": launch(k.project, (views, vertices), surfaces, *frames, a.projected),
             "cover": launch(
                 k.cover,
                 len(scene.triangles),
-                *(surfaces, *frames, self._eyes, self._projected, 0, self._keys),
+                *(
+                    surfaces,
+                    *frames,
+                    a.eyes,
+                    a.projected,
+                    0,
+                    a.keys,
+                ),
             ),
             "shade": launch(
                 k.shade,
-                self._colors.shape[:2],
-                *(surfaces, self._views, self._lights, self._maps, self._pose, self._projected),
-                *(self._keys, self._behind, self._shadowed, self._samples, self._colors),
+                a.colors.shape[:2],
+                *(
+                    surfaces,
+                    a.views,
+                    a.lights,
+                    a.maps,
+                    a.pose,
+                    a.projected,
+                ),
+                *(
+                    a.keys,
+                    a.behind,
+                    a.shadowed,
+                    self._samples,
+                    a.colors,
+                ),
             ),
             "measure": launch(
                 k.measure,
-                self._depth.shape,
-                *(surfaces, self._keys, self._behind, self._samples, self._depth, self._geom),
+                a.depth.shape,
+                *(
+                    surfaces,
+                    a.keys,
+                    a.behind,
+                    self._samples,
+                    a.depth,
+                    a.geom,
+                ),
             ),
         }
         for n in range(len(self._shadows)):
             commands[f"shadow {n}"] = launch(
                 k.cover,
                 len(scene.triangles),
-                *(surfaces, *frames, self._eyes, self._projected, 1 + n),
-                self._maps[n].reshape(-1),
+                *(surfaces, *frames, a.eyes, a.projected, 1 + n),
+                a.maps[n].reshape(-1),
             )
         return commands
 
     def _draw(self) -> None:
         """Everything but the colours: poses, background, z-buffer, shadow maps."""
         data = self._data
-        self._positions.assign(data.geom_xpos)
-        self._rotations.assign(data.geom_xmat.reshape(-1, 3, 3))
+        self._arrays.positions.assign(data.geom_xpos)
+        self._arrays.rotations.assign(data.geom_xmat.reshape(-1, 3, 3))
         still = (
             data.cam_xpos[self._camera].tobytes(),
             data.cam_xmat[self._camera].tobytes(),
@@ -238,8 +273,8 @@ class RasterRenderer:
         if moved:
             self._commands["paint"].launch()
             self._still = still
-        self._keys.zero_()
-        self._maps.zero_()
+        self._arrays.keys.zero_()
+        self._arrays.maps.zero_()
         self._commands["project"].launch()
         self._commands["cover"].launch()
         for n in range(len(self._shadows)):
@@ -259,8 +294,8 @@ class RasterRenderer:
         for n, index in enumerate(self._shadows):
             views["eye"][1 + n] = lights["position"][index]
             views["axes"][1 + n] = _axes(lights["direction"][index])
-        self._views.assign(views)
-        self._lights.assign(lights)
+        self._arrays.views.assign(views)
+        self._arrays.lights.assign(lights)
 
 
 def _axes(direction: NDArray[Any]) -> NDArray[Any]:

@@ -87,29 +87,37 @@ def _shift_by_index(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
     return gathered.permute(0, 3, 1, 2, 4)
 
 
-def to_input(images: Tensor, dtype: torch.dtype) -> Tensor:
-    """Stacked bytes (B, K, H, W, C) to what a convolution reads: (B, K C, H, W), x - 128.
+def to_input(images: Tensor, dtype: torch.dtype, middle: int = 128) -> Tensor:
+    """Stacked bytes (B, K, H, W, C) to what a convolution reads: (B, K C, H, W), x - middle.
 
     These whole numbers are exact in bf16, which x / 255 - 0.5 is not; the scale is left to the
     weights (`encoders.ConvEncoder`). The memory is in channels-last order, which convolutions are
     fastest with.
+
+    Args:
+        images: uint8; no byte further from `middle` than a signed byte reaches.
+        dtype: of the result.
+        middle: what is subtracted.
     """
-    return _centred(images).view(torch.int8).flatten(3).to(dtype).permute(0, 3, 1, 2)
+    return _centred(images, middle).view(torch.int8).flatten(3).to(dtype).permute(0, 3, 1, 2)
 
 
-def _centred(images: Tensor) -> Tensor:
-    """(B, K, H, W, C) to (B, H, W, K, C), a pixel's channels side by side, each byte less 128."""
+def _centred(images: Tensor, middle: int) -> Tensor:
+    """(B, K, H, W, C) to (B, H, W, K, C), a pixel's channels side by side, less `middle`.
+
+    A difference below 0 wraps around, to the bits of the signed byte.
+    """
     if images.device.type != "cpu":
-        return _centred_at_once(images)
+        return _centred_at_once(images, middle)
     batch, stack, height, width, channels = images.shape
     interleaved = images.new_empty((batch, height, width, stack, channels))
     # A copy per channel runs along whole images; one permuted copy would run along three bytes.
     for frame in range(stack):
         for channel in range(channels):
             interleaved[..., frame, channel] = images[:, frame, ..., channel]
-    return interleaved.bitwise_xor_(128)
+    return interleaved.sub_(middle)
 
 
-def _centred_at_once(images: Tensor) -> Tensor:
+def _centred_at_once(images: Tensor, middle: int) -> Tensor:
     """Where a launch costs more than what it moves; the shift leaves them in this order already."""
-    return images.permute(0, 2, 3, 1, 4).contiguous().bitwise_xor(128)
+    return images.permute(0, 2, 3, 1, 4).contiguous() - middle

@@ -24,7 +24,12 @@ from numpy.typing import NDArray
 
 from merl.core import EnvironmentsLost, MerlError, Observation
 from merl.training.config import TrainConfig
-from merl.training.environment import environment_state, make_run_env, set_environment_state
+from merl.training.environment import (
+    EnvSpaces,
+    environment_state,
+    make_run_env,
+    set_environment_state,
+)
 
 _INFO = ("success", "reward_terms")
 """What the loop wants to know beside the reward."""
@@ -250,7 +255,8 @@ class Workers:
 
     def _started(self) -> AsyncVectorEnv:
         self._lost = None
-        makers = [_Maker(self._config, index, self._here) for index in range(self.count)]
+        expected = EnvSpaces.of(self._config, self._here)
+        makers = [_Maker(self._config, index, expected, self._here) for index in range(self.count)]
         others = multiprocessing.active_children()
         with (
             self._loss(),
@@ -353,6 +359,7 @@ class _Maker:
 
     config: TrainConfig
     index: int
+    expected: EnvSpaces
     here: gymnasium.Env[Any, Any] | None
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
@@ -361,7 +368,9 @@ class _Maker:
         for number in _LEFT_TO_THE_RUN:
             signal.signal(number, signal.SIG_IGN)
         with _errors_that_arrive():
-            return _Worker(make_run_env(self.config), self.index)
+            env = make_run_env(self.config)
+            self.expected.check(EnvSpaces.of(self.config, env), f"number {self.index}")
+            return _Worker(env, self.index)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"config": self.config, "index": self.index, "here": None}
+        return {**vars(self), "here": None}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -14,11 +15,12 @@ from gymnasium.wrappers import FilterObservation
 
 from merl.agents.config import AgentConfig
 from merl.agents.networks import modalities, told_to_critic
-from merl.core import MerlError
+from merl.core import MerlError, is_image
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
 from merl.envs.config import OBSERVATIONS, EnvConfig
 from merl.envs.own import make_own
+from merl.envs.user_spaces import brief
 from merl.training.config import TrainConfig
 
 
@@ -39,7 +41,7 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
                 f"{', '.join(changes)} is for merl's own tasks: {config.task} decides for itself "
                 "how it is seen"
             )
-        env = make_own(config.task, render_mode)
+        env = make_own(config.task, render_mode, config.user_env)
     else:
         seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))
         settings = {name: getattr(seen, name) for name in type(seen).__dataclass_fields__}
@@ -72,6 +74,108 @@ def own_bounds(env: gymnasium.Env[Any, Any]) -> tuple[list[float], list[float]] 
     return bounds
 
 
+@dataclass(frozen=True)
+class EnvSpaces:
+    """The spaces by which two instances of an environment are recognised as the same.
+
+    Attributes:
+        observation: what the agent consumes.
+        action: what it does, in [-1, 1].
+        bounds: of the environment's own actions, where they were rescaled.
+    """
+
+    observation: spaces.Dict
+    action: spaces.Box
+    bounds: tuple[list[float], list[float]] | None
+
+    @classmethod
+    def of(cls, config: TrainConfig, env: gymnasium.Env[Any, Any]) -> EnvSpaces:
+        """The spaces of a run's environment."""
+        return cls(*run_spaces(config, env), own_bounds(env))
+
+    def check(self, other: EnvSpaces, what: str) -> None:
+        """Check that another instance has the same spaces.
+
+        Args:
+            other: its spaces.
+            what: the other instance, for the message.
+
+        Raises:
+            MerlError: naming what differs.
+        """
+        mine, theirs = self._parts(), other._parts()
+        differs = []
+        for name in mine | theirs:
+            one, two = mine.get(name), theirs.get(name)
+            if one != two:
+                words = "not there" if one is None else _in_words(one)
+                differs.append(f"{name} is {words} and {_in_words(two) if two else 'not there'}")
+        if differs:
+            raise MerlError(
+                f"two instances of the environment differ, the first one and {what}: "
+                f"{'; '.join(differs)}: make all instances alike"
+            )
+
+    def _parts(self) -> dict[str, Any]:
+        parts: dict[str, Any] = {
+            f"observation {key!r}": space for key, space in self.observation.items()
+        }
+        return parts | {"action": self.action, "the actions' bounds": self.bounds}
+
+
+def _in_words(part: Any) -> str:
+    if isinstance(part, spaces.Space):
+        return brief(part)
+    low, high = part
+    return f"low {low}, high {high}"
+
+
+def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
+    """Say which observation keys the agent uses, as what, and which it leaves out and why.
+
+    Args:
+        config: of the run.
+        env: made by `make_run_env`.
+
+    Returns:
+        A line each for images, vectors, those for the critic alone, and those left out.
+    """
+    space, _ = run_spaces(config, env)
+    images, vectors = modalities(config.agent, space)
+    words = {
+        key: " x ".join(map(str, box.shape or ()))
+        + (f" from {box.low.min()} to {box.high.max()}" if key in images else " numbers")
+        for key, box in space.items()
+        if isinstance(box, spaces.Box)
+    }
+    groups = {
+        "the agent sees the images": images,
+        "the agent uses the vectors": vectors,
+        "the critic alone uses": told_to_critic(config.agent, space),
+    }
+    lines = [
+        f"{what} {', '.join(f'{key} ({words[key]})' for key in keys)}"
+        for what, keys in groups.items()
+        if keys
+    ]
+    left_out = {}
+    if env.has_wrapper_attr("left_out"):
+        for key, given in env.get_wrapper_attr("modalities").items():
+            if key not in space:
+                kind, chosen = (
+                    ("images", config.agent.images)
+                    if is_image(given.space)
+                    else ("vectors", config.agent.vectors)
+                )
+                others = "names others" if chosen else f"of agent {config.agent_name} names none"
+                left_out[key] = f"--agent.{kind} {others}"
+        left_out |= env.get_wrapper_attr("left_out")
+    if left_out:
+        each = "; ".join(f"{key!r}, {reason}" for key, reason in left_out.items())
+        lines.append(f"not used: {each}")
+    return lines
+
+
 def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
     """Where the environment's random numbers stand, as plain types; None if it does not tell.
 
@@ -96,12 +200,15 @@ def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any]
 
 
 def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
-    """Of what the Jaco environments can give: what the agent names, else what the config has."""
+    """Of what the Jaco environments can give: what the agent names, else what the config has.
+
+    `state`, which no robot could measure, has to be named.
+    """
     images, vectors = agent.images, agent.vectors
     default = [
         name
         for name in env.observations
-        if (images is None if name == "image" else vectors is None)
+        if (images is None if name == "image" else vectors is None and name != "state")
     ]
     named = {*(images or ()), *(vectors or ()), *agent.critic_vectors}
     if not named <= set(OBSERVATIONS):  # the agent's check says which there are

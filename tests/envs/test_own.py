@@ -6,6 +6,7 @@ import signal
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium
 import numpy as np
@@ -14,6 +15,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from merl.core import EnvironmentFailed, MerlError, NotFinite
+from merl.envs.adapted import in_one_line
 from merl.envs.own import adapt, make_own
 
 
@@ -300,3 +302,53 @@ def test_a_close_that_fails_stops_nothing() -> None:
 
     with pytest.warns(UserWarning, match="close raised OSError: the port is busy"):
         adapt(Stuck(vector(2))).close()
+
+
+def place_of(path: Path, code: str) -> str:
+    """What is said of the exception that this file's `step` raises."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(code)
+    names: dict[str, Any] = {}
+    exec(compile(code, str(path), "exec"), names)
+    try:
+        names["step"]()
+    except Exception as error:
+        return in_one_line(error)
+    raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("inner", "raised"),
+    [
+        ("import json; json.loads('{')", "JSONDecodeError"),  # raised in the standard library
+        ("import numpy; numpy.linalg.inv([[0.0]])", "LinAlgError"),  # in an installed package
+        ("import gymnasium; gymnasium.make('No-v0')", "NameNotFound"),
+        ("exec(compile('1 / 0', '<string>', 'exec'))", "ZeroDivisionError"),
+        ("exec(compile('1 / 0', 'gone.py', 'exec'))", "ZeroDivisionError"),  # no such file
+        ("import merl.envs as e; e.make_env('x')", "MerlError"),
+        ("raise OSError('servo 3')", "OSError: servo 3"),
+    ],
+)
+def test_the_place_of_an_error_is_the_last_one_in_a_file_of_the_users(
+    inner: str, raised: str, tmp_path: Path
+) -> None:
+    told = place_of(tmp_path / "arm.py", f"def step():\n    {inner}\n")
+    assert told.startswith(raised)
+    assert told.endswith("(arm.py, line 2)")
+
+
+def test_a_place_that_cannot_be_opened_is_not_named(tmp_path: Path) -> None:
+    code = "def step():\n    raise OSError('servo 3')\n"
+    installed = tmp_path / "lib" / "site-packages" / "driver.py"
+    assert "driver.py" not in place_of(installed, code)
+    assert place_of(tmp_path / "merl_arm.py", code).endswith("(merl_arm.py, line 2)")
+    with patch("merl.envs.adapted.__file__", str(tmp_path / "merl" / "envs" / "adapted.py")):
+        assert "dot.py" not in place_of(tmp_path / "merl" / "dot.py", code)
+        assert place_of(tmp_path / "merl_arm" / "arm.py", code).endswith("(arm.py, line 2)")
+    (tmp_path / "gone.py").write_text(code)
+    names: dict[str, Any] = {}
+    exec(compile(code, str(tmp_path / "gone.py"), "exec"), names)
+    (tmp_path / "gone.py").unlink()
+    with pytest.raises(OSError, match="servo") as caught:
+        names["step"]()
+    assert "gone.py" not in in_one_line(caught.value)

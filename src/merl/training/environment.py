@@ -161,7 +161,7 @@ def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
     left_out = {}
     if env.has_wrapper_attr("left_out"):
         for key, given in env.get_wrapper_attr("modalities").items():
-            if key not in space:
+            if key not in space.spaces:  # a space contains observations, not keys
                 kind, chosen = (
                     ("images", config.agent.images)
                     if is_image(given.space)

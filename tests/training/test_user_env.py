@@ -124,18 +124,22 @@ def test_every_modality_is_used_and_the_rest_is_said(
         expected = [start + ", ".join(words[key] for key in keys)] if keys else []
         assert [line for line in lines if line.startswith(start)] == expected
     left_out = lines[-1]
-    assert left_out.startswith("not used: ")
-    assert "'gear', Discrete(3): give it as one-hot" in left_out
+    assert "'gear' is not used: Discrete(3): give it as one-hot" in left_out
     for key in words:
-        assert (f"{key!r}, --agent." in left_out) == (key not in [*images, *vectors, *critic])
+        assert (f"{key!r} is not used: --agent." in left_out) == (
+            key not in [*images, *vectors, *critic]
+        )
 
 
 def test_the_reason_names_the_option_that_works() -> None:
     config = config_of("drqv2")
     left_out = key_lines(config, make_run_env(config))[-1]
-    assert "'joints', --agent.vectors of agent drqv2 names none" in left_out
+    assert "'joints' is not used: --agent.vectors of agent drqv2 names none" in left_out
     config = config_of("merl", images=("mask",))
-    assert "'pixels', --agent.images names others" in key_lines(config, make_run_env(config))[-1]
+    assert (
+        "'pixels' is not used: --agent.images names others"
+        in key_lines(config, make_run_env(config))[-1]
+    )
 
 
 def test_a_plain_box_needs_no_name() -> None:
@@ -169,7 +173,7 @@ def test_a_run_says_its_keys_and_resumes_with_them(
     assert main([*line, *narrow]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "the agent sees the images mask (24 x 26 x 1 from 0 to 1)" in said
-    assert "not used: 'pixels', --agent.images names others" in said
+    assert "'pixels' is not used: --agent.images names others" in said
     file = run / "config.json"
     record = json.loads(file.read_text())
     assert record["observation_space"]["mask"]["bounds"] == [0, 1]

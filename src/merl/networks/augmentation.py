@@ -95,29 +95,29 @@ def to_input(images: Tensor, dtype: torch.dtype, middle: int = 128) -> Tensor:
     fastest with.
 
     Args:
-        images: uint8; no byte further from `middle` than a signed byte reaches.
+        images: uint8.
         dtype: of the result.
         middle: what is subtracted.
     """
-    return _centred(images, middle).view(torch.int8).flatten(3).to(dtype).permute(0, 3, 1, 2)
+    pixels = _centred(images).view(torch.int8).flatten(3).to(dtype)
+    if middle != 128:
+        pixels = pixels + (128 - middle)
+    return pixels.permute(0, 3, 1, 2)
 
 
-def _centred(images: Tensor, middle: int) -> Tensor:
-    """(B, K, H, W, C) to (B, H, W, K, C), a pixel's channels side by side, less `middle`.
-
-    A difference below 0 wraps around, to the bits of the signed byte.
-    """
+def _centred(images: Tensor) -> Tensor:
+    """(B, K, H, W, C) to (B, H, W, K, C), a pixel's channels side by side, each byte less 128."""
     if images.device.type != "cpu":
-        return _centred_at_once(images, middle)
+        return _centred_at_once(images)
     batch, stack, height, width, channels = images.shape
     interleaved = images.new_empty((batch, height, width, stack, channels))
     # A copy per channel runs along whole images; one permuted copy would run along three bytes.
     for frame in range(stack):
         for channel in range(channels):
             interleaved[..., frame, channel] = images[:, frame, ..., channel]
-    return interleaved.sub_(middle)
+    return interleaved.bitwise_xor_(128)
 
 
-def _centred_at_once(images: Tensor, middle: int) -> Tensor:
+def _centred_at_once(images: Tensor) -> Tensor:
     """Where a launch costs more than what it moves; the shift leaves them in this order already."""
-    return images.permute(0, 2, 3, 1, 4).contiguous() - middle
+    return images.permute(0, 2, 3, 1, 4).contiguous().bitwise_xor(128)

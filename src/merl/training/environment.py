@@ -171,8 +171,7 @@ def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
                 left_out[key] = f"--agent.{kind} {others}"
         left_out |= env.get_wrapper_attr("left_out")
     if left_out:
-        each = "; ".join(f"{key!r}, {reason}" for key, reason in left_out.items())
-        lines.append(f"not used: {each}")
+        lines.append("; ".join(f"{key!r} is not used: {why}" for key, why in left_out.items()))
     return lines
 
 

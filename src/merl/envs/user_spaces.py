@@ -82,7 +82,7 @@ class Modality:
         if (low, high) != BYTES and (array.min() < low or array.max() > high):
             raise EnvironmentFailed(
                 f"{name} has pixels from {array.min()} to {array.max()}, but its space says {low} "
-                f"to {high}"
+                f"to {high}: give its box the bounds of its pixels"
             )
         moved = np.moveaxis(array, 0, -1) if self.channels_first else array
         return moved.reshape(self.space.shape)
@@ -142,8 +142,8 @@ def advice(space: spaces.Space[Any]) -> str:
         return _image_advice(space)
     size = int(np.prod(space.shape))
     return (
-        "merl stacks frames by itself, those of images: leave out a wrapper that stacks; where the "
-        f"history of these numbers matters, or they are a table, flatten them to a box ({size},)"
+        "merl stacks the frames of images by itself, so leave out a wrapper that stacks; to keep a "
+        f"history or a table of numbers, flatten it to a box ({size},)"
     )
 
 

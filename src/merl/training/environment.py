@@ -108,8 +108,7 @@ class EnvSpaces:
         for name in mine | theirs:
             one, two = mine.get(name), theirs.get(name)
             if one != two:
-                words = "not there" if one is None else _in_words(one)
-                differs.append(f"{name} is {words} and {_in_words(two) if two else 'not there'}")
+                differs.append(f"{name} is {_in_words(one)} and {_in_words(two)}")
         if differs:
             raise MerlError(
                 f"two instances of the environment differ, the first one and {what}: "
@@ -124,6 +123,8 @@ class EnvSpaces:
 
 
 def _in_words(part: Any) -> str:
+    if part is None:
+        return "not there"
     if isinstance(part, spaces.Space):
         return brief(part)
     low, high = part
@@ -142,37 +143,39 @@ def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
     """
     space, _ = run_spaces(config, env)
     images, vectors = modalities(config.agent, space)
-    words = {
-        key: " x ".join(map(str, box.shape or ()))
-        + (f" from {box.low.min()} to {box.high.max()}" if key in images else " numbers")
-        for key, box in space.items()
-        if isinstance(box, spaces.Box)
-    }
     groups = {
-        "the agent sees the images": images,
-        "the agent uses the vectors": vectors,
-        "the critic alone uses": told_to_critic(config.agent, space),
+        "images used": images,
+        "vectors used": vectors,
+        "vectors used by the critic alone": told_to_critic(config.agent, space),
     }
     lines = [
-        f"{what} {', '.join(f'{key} ({words[key]})' for key in keys)}"
-        for what, keys in groups.items()
+        f"{group}: {', '.join(f'{key} ({_size(space[key])})' for key in keys)}"
+        for group, keys in groups.items()
         if keys
     ]
     left_out = {}
     if env.has_wrapper_attr("left_out"):
         for key, given in env.get_wrapper_attr("modalities").items():
-            if key not in space.spaces:  # a space contains observations, not keys
-                kind, chosen = (
-                    ("images", config.agent.images)
-                    if is_image(given.space)
-                    else ("vectors", config.agent.vectors)
+            if key in space.spaces:  # `key in space` would ask whether it is an observation
+                continue
+            kind = "images" if is_image(given.space) else "vectors"
+            left_out[key] = f"--agent.{kind} names others"
+            if not getattr(config.agent, kind):
+                left_out[key] = (
+                    f"agent {config.agent_name} uses no {kind}, --agent.{kind} adds them"
                 )
-                others = "names others" if chosen else f"of agent {config.agent_name} names none"
-                left_out[key] = f"--agent.{kind} {others}"
         left_out |= env.get_wrapper_attr("left_out")
     if left_out:
         lines.append("; ".join(f"{key!r} is not used: {why}" for key, why in left_out.items()))
     return lines
+
+
+def _size(space: spaces.Space[Any]) -> str:
+    assert isinstance(space, spaces.Box)
+    if is_image(space):
+        height, width, channels = space.shape
+        return f"{height} x {width} x {channels}, from {space.low.min()} to {space.high.max()}"
+    return "1 number" if space.shape == (1,) else f"{space.shape[0]} numbers"
 
 
 def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:

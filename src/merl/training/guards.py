@@ -27,7 +27,9 @@ def check_moment(observation: Observation, reward: float, step: int, where: str 
         NotFinite: naming the value and the step.
     """
     at = f"at step {step:,} {where}".rstrip()
-    if not abs(reward) <= float(np.finfo(np.float32).max):  # beyond it, the replay would keep infinity
+    if not abs(reward) <= float(
+        np.finfo(np.float32).max
+    ):  # beyond it, the replay would keep infinity
         beyond = ", which is beyond float32," if math.isfinite(reward) else ""
         raise NotFinite(f"the environment's reward is {reward}{beyond} {at}")
     for key, value in observation.items():

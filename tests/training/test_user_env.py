@@ -26,6 +26,7 @@ from merl.training.config import TrainConfig
 from merl.training.environment import EnvSpaces, key_lines, make_run_env, run_spaces
 from merl.training.evaluation import evaluate
 from merl.training.parts import Parts
+from merl.training.plain import box, describe, told
 from merl.training.run import Run
 
 LENGTH = 5
@@ -362,8 +363,10 @@ def test_a_worker_compares_its_instance_with_the_first(monkeypatch: pytest.Monke
     config = compose("smoke", f"{here}:Changing")
     expected = EnvSpaces.of(config, make_run_env(config))
     monkeypatch.setattr("signal.signal", lambda *_: None)
-    with pytest.raises(MerlError, match="the first one and number 1: the actions' bounds"):
-        _Maker(config, 1, expected, None)()
+    worker = _Maker(config, 1, expected, None)()
+    assert worker.observation_space == expected.observation
+    with pytest.raises(MerlError, match="and that of worker 1: the actions' bounds"):
+        worker.reset()
 
 
 def test_how_spaces_are_read_is_part_of_the_config() -> None:
@@ -378,3 +381,11 @@ class Wide(Toy):
     """Actions whose bounds are placeholders."""
 
     action_space = spaces.Box(-1e30, 1e30, (2,), np.float32)
+
+
+def test_pixel_bounds_are_recorded_and_others_are_refused() -> None:
+    mask, picture = (spaces.Box(0, high, (24, 24, 1), np.uint8) for high in (1, 255))
+    assert box(describe(mask)) == mask
+    assert told(describe(mask)) == "uint8 (24, 24, 1) from 0 to 1"
+    assert told(describe(mask)) != told(describe(picture))
+    assert told(describe(vector(3))) == told(describe(spaces.Box(-1, 1, (3,), np.float32)))

@@ -205,6 +205,9 @@ def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
     """Of what the Jaco environments can give: what the agent names, else what the config has.
 
     `state`, which no robot could measure, has to be named.
+
+    Raises:
+        MerlError: nothing but `state` is left, and it is not named.
     """
     images, vectors = agent.images, agent.vectors
     default = [
@@ -216,4 +219,9 @@ def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
     if not named <= set(OBSERVATIONS):  # the agent's check says which there are
         return OBSERVATIONS
     asked = [name for name in OBSERVATIONS if name in named or name in default]
+    if not asked and vectors is None and "state" in env.observations:
+        raise MerlError(
+            f"the agent finds nothing to sense among {sorted(env.observations)}: name it with "
+            "--agent.vectors state, or take --agent merl_state, ddpg or sac"
+        )
     return tuple(asked) or env.observations

@@ -285,9 +285,13 @@ def test_an_arm_that_has_become_another_is_refused(
     ("arguments", "says"),
     [
         (["CartPole-v1"], "actions are Discrete(2)"),
-        (["Pendulum-v1"], "take --agent merl_state, ddpg or sac"),
         (["Pendulum-v1", "--agent", "drqv2"], "or take --agent merl_state, ddpg or sac"),
-        (["merl.envs.dot:whole", "--agent", "sac"], "agent.vectors names 'state'"),
+        (
+            ["merl.envs.dot:whole", "--agent", "sac", "--agent.vectors", "state"],
+            "agent.vectors names 'state', but the environment gives ['joints']",
+        ),
+        (["reach_duplo", "--env.image-layout", "chw"], "for an environment of your own"),
+        (["reach_duplo", "--env.allow-wide-actions"], "for an environment of your own"),
         (["Pendulum-v1", "--agent", "ddgp"], "did you mean 'ddpg'"),
         (["Pendulum-v1", "--agent", "ddpg", "--renderer", "gl"], "--renderer is for merl's own"),
         (["Pendulm-v1", "--agent", "ddpg"], "did you mean 'Pendulum-v1'"),
@@ -297,7 +301,7 @@ def test_an_arm_that_has_become_another_is_refused(
         (["gymnasium:make"], "takes no arguments"),
         (["merl/MoveBox-v0"], "call it move_box"),
         (["merl:merl/MoveBox-v0"], "call it move_box"),
-        (["merl.envs.dot:whole", "--agent", "ddpg"], "or have it give 'state'"),
+        (["merl.envs.dot:whole", "--agent", "ddpg", "--agent.vectors", "x"], "have it give 'x'"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(

@@ -54,7 +54,11 @@ def test_the_dot_is_narrowed_as_well() -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"critic_vectors": ("proprio",)}, "which the actor has already"),
+        (
+            {"vectors": ("proprio",), "critic_vectors": ("proprio",)},
+            "which the actor has already",
+        ),
+        ({"images": (), "critic_vectors": ("proprio",)}, "leaves the actor nothing"),
         ({"critic_vectors": ("touch",)}, "agent.critic-vectors names 'touch'"),
         ({"critic_vectors": ("state",), "fusion": "shared"}, "use --agent.fusion decoupled"),
         (

@@ -16,7 +16,7 @@ from merl.training import loop
 from merl.training.acting import Here
 from merl.training.config import TrainConfig
 from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train, updates_due
-from merl.training.rollout import Episode, Fetched, FrameStack
+from merl.training.rollout import Episode, Fetched, FrameStack, mean_metrics
 from merl.training.updating import UpdateFromHost, UpdateOnDevice, update_from_host
 from toy import DotEnv
 
@@ -272,6 +272,20 @@ def test_an_episode_sums_what_its_steps_bring() -> None:
     silent = Episode()
     silent.add(1.0, {})
     assert silent.metrics() == {"return": 1.0, "length": 1.0}
+    failed = {"success_end": 0.0, "success_any": 0.0, "success_share": 0.0}
+    assert silent.metrics(reports_success=True) == silent.metrics() | failed
+    assert mean_metrics([silent, silent], reports_success=True) == silent.metrics() | failed
+    assert mean_metrics([silent, episode])["success_any"] == 0.5
+
+
+def test_success_is_shared_among_the_steps_that_report_it() -> None:
+    episode = Episode()
+    for info in ({}, {"success": True}, {}, {"success": False}, {"success": True}):
+        episode.add(0.0, info)
+    assert episode.metrics()["success_share"] == 2 / 3
+    assert episode.metrics()["success_end"] == 1.0
+    episode.add(0.0, {})  # the last step does not say so
+    assert (episode.metrics()["success_end"], episode.metrics()["success_any"]) == (0.0, 1.0)
 
 
 def test_a_frame_that_is_refilled_does_not_change_the_stack() -> None:

@@ -63,7 +63,12 @@ def evaluate(args: list[str]) -> int:
     env = policy.make_env(**changes)
     try:
         result = evaluate_policy(
-            policy, env, options.episodes, reset=policy.reset, video=options.video
+            policy,
+            env,
+            options.episodes,
+            reset=policy.reset,
+            video=options.video,
+            reports_success=policy.reports_success,
         )
     finally:
         env.close()
@@ -79,7 +84,10 @@ def evaluate(args: list[str]) -> int:
         console.print(f"video: {options.video}", highlight=False, soft_wrap=True)
     if options.json is not None:
         rows = [
-            {"seed": EVALUATION_SEED + i, **episode.metrics()}
+            {
+                "seed": EVALUATION_SEED + i,
+                **episode.metrics(reports_success=result.success_end is not None),
+            }
             for i, episode in enumerate(result.episodes)
         ]
         write_json(options.json, {"run": str(options.run), "step": policy.step, "episodes": rows})

@@ -16,7 +16,7 @@ from merl.training import trainer
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
 from merl.training.console import ConsoleView
-from merl.training.environment import own_bounds
+from merl.training.environment import key_lines, own_bounds
 from merl.training.parts import Parts
 from merl.training.resuming import taken_up
 from merl.training.run import Run, resume_line
@@ -122,6 +122,7 @@ def _outlook(parts: Parts, what: str, done: int) -> str:
     ]
     if seconds > 86_400 and config.preset != "laptop":
         lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
+    lines += key_lines(config, parts.env)
     lines += [
         f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms a step{pictures}",
         f"the replay takes {decimal(size)} for {config.capacity:,} steps",

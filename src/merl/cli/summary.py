@@ -31,7 +31,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
     beside = references(run.config.task, run.config.env)
     if not beside and run.config.eval.references:
         with console.status(f"what {' and '.join(FLOORS)} are paid, to compare with"):
-            beside = _measured(run.config, console)
+            beside = _measured(run.config, console, trained.success_end is not None)
     console.print()
     console.print(comparison(run.config.task, trained, beside))
     lines = {reference.name: reference.returns.mean for reference in beside}
@@ -53,7 +53,9 @@ def summarize(outcome: Outcome, console: Console) -> None:
     )
 
 
-def floors(config: TrainConfig, episodes: int = 20) -> tuple[Reference, ...]:
+def floors(
+    config: TrainConfig, episodes: int = 20, *, reports_success: bool = False
+) -> tuple[Reference, ...]:
     """Random actions, and none (the middle of their range), from the evaluation's starts."""
     env = make_run_env(config)
     rng = np.random.default_rng(0)
@@ -64,7 +66,9 @@ def floors(config: TrainConfig, episodes: int = 20) -> tuple[Reference, ...]:
         lambda _: np.zeros(shape, np.float32),
     )
     try:
-        results = [evaluate(act, env, episodes) for act in policies]
+        results = [
+            evaluate(act, env, episodes, reports_success=reports_success) for act in policies
+        ]
     finally:
         env.close()
     return tuple(
@@ -90,10 +94,12 @@ def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> T
     return table
 
 
-def _measured(config: TrainConfig, console: Console) -> tuple[Reference, ...]:
+def _measured(
+    config: TrainConfig, console: Console, reports_success: bool
+) -> tuple[Reference, ...]:
     """What can be measured of the references that need no skill; the run is over in any case."""
     try:
-        return floors(config)
+        return floors(config, reports_success=reports_success)
     except MerlError as error:
         console.print(f"there is nothing to compare with: {error}", highlight=False)
         return ()

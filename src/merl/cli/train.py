@@ -46,6 +46,11 @@ def train(args: list[str]) -> int:
             f"{', '.join(changed)} is for merl's own tasks: {config.task} decides for itself how "
             "it is seen"
         )
+    if not config.own_env and config.user_env != default.user_env:
+        raise MerlError(
+            f"--env.image-layout and --env.allow-wide-actions are for an environment of your own: "
+            f"leave them out for {config.task}"
+        )
     if options.resume:
         if config.run_dir is None:
             raise MerlError("--resume needs --run-dir: which run is to go on?")

@@ -13,6 +13,7 @@ StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
 RewardName = Literal["paper", "staged", "near", "far", "both"]
 FloorName = Literal["rough", "smooth"]
+ImageLayout = Literal["auto", "hwc", "chw"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 
@@ -88,3 +89,18 @@ class EnvConfig:
                     f"{field} is {size!r}: give a whole number, at least {SMALLEST_IMAGE} and at "
                     f"most {LARGEST_IMAGE}"
                 )
+
+
+@dataclass(frozen=True)
+class UserEnvConfig:
+    """How the spaces of a user's own environment are read."""
+
+    image_layout: ImageLayout = "auto"
+    """Order of the axes of the environment's images: `hwc` (height, width, channels), `chw`
+    (channels, height, width), or `auto`, which recognises the channels by their number."""
+
+    allow_wide_actions: bool = False
+    """Accept actions whose bounds are more than 1,000,000 apart."""
+
+    def __post_init__(self) -> None:
+        check_choice("env.image-layout", self.image_layout, get_args(ImageLayout))

@@ -16,16 +16,20 @@ from gymnasium.envs.registration import registry
 
 from merl.core import MerlError, meant
 from merl.envs.adapted import adapt, failing, in_one_line
+from merl.envs.config import UserEnvConfig
 from merl.envs.registration import ENV_IDS
 
 
-def make_own(task: str, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+def make_own(
+    task: str, render_mode: str | None = None, config: UserEnvConfig | None = None
+) -> gymnasium.Env[Any, Any]:
     """An environment that merl does not bring along, in the form that agents take.
 
     Args:
         task: a Gymnasium id (`Pendulum-v1`, `module:Id-v0`), or `module:function`, the function
             being called without arguments, or with `render_mode` if it knows that.
         render_mode: what is asked of it; where it cannot render, it is made without.
+        config: how its spaces are read.
 
     Returns:
         The environment, adapted (`Adapted`).
@@ -38,7 +42,7 @@ def make_own(task: str, render_mode: str | None = None) -> gymnasium.Env[Any, An
         env.close()
         env = _make(task, None)
     try:
-        return adapt(env)
+        return adapt(env, config)
     except BaseException:
         env.close()
         raise

@@ -12,6 +12,7 @@ import tyro
 from merl.agents import AGENTS
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
+from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 from merl.training.config import EvaluationConfig, Setting, TrainConfig
 
@@ -175,5 +176,7 @@ def compose(
         replay = dataclasses.replace(config.replay, **theirs.replay)
         config = dataclasses.replace(config, replay=replay, **theirs.run)
         values = dict(theirs.agent)
+    if base.vectors and task not in ENV_IDS:  # `state` is a name of merl's own tasks
+        values["vectors"] = None
     made = dataclasses.replace(base, **values)
     return dataclasses.replace(config, agent_name=name, agent=made)

@@ -22,9 +22,14 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.async_vector_env import AsyncState
 from numpy.typing import NDArray
 
-from merl.core import EnvironmentsLost, MerlError, Observation
+from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
 from merl.training.config import TrainConfig
-from merl.training.environment import environment_state, make_run_env, set_environment_state
+from merl.training.environment import (
+    EnvSpaces,
+    environment_state,
+    make_run_env,
+    set_environment_state,
+)
 
 _INFO = ("success", "reward_terms")
 """What the loop wants to know beside the reward."""
@@ -250,7 +255,8 @@ class Workers:
 
     def _started(self) -> AsyncVectorEnv:
         self._lost = None
-        makers = [_Maker(self._config, index, self._here) for index in range(self.count)]
+        expected = EnvSpaces.of(self._config, self._here)
+        makers = [_Maker(self._config, index, expected, self._here) for index in range(self.count)]
         others = multiprocessing.active_children()
         with (
             self._loss(),
@@ -340,11 +346,23 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
             set_environment_state(self.env, states[self._index])
 
 
-class _Lent(gymnasium.Env[Any, Any]):
-    """The spaces of an environment, for who wants to make one only to look at it."""
+class _StandIn(gymnasium.Env[Any, Any]):
+    """Has the spaces of an environment, and nothing else.
 
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        self.observation_space, self.action_space = env.observation_space, env.action_space
+    Args:
+        expected: its spaces.
+        error: why the environment cannot be used; `reset` raises it, since an exception while a
+            worker starts does not reach the run.
+    """
+
+    def __init__(self, expected: EnvSpaces, error: MerlError | None = None) -> None:
+        self.observation_space, self.action_space = expected.observation, expected.action
+        self._error = error
+
+    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+        if self._error is not None:
+            raise self._error
+        raise NotImplementedError
 
 
 @dataclass
@@ -353,15 +371,22 @@ class _Maker:
 
     config: TrainConfig
     index: int
+    expected: EnvSpaces
     here: gymnasium.Env[Any, Any] | None
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
         if self.here is not None:
-            return _Lent(self.here)
+            return _StandIn(self.expected)
         for number in _LEFT_TO_THE_RUN:
             signal.signal(number, signal.SIG_IGN)
         with _errors_that_arrive():
-            return _Worker(make_run_env(self.config), self.index)
+            env = make_run_env(self.config)
+        try:
+            self.expected.check(EnvSpaces.of(self.config, env), f"that of worker {self.index}")
+        except MerlError as error:
+            env.close()
+            env = _StandIn(self.expected, EnvironmentFailed(str(error)))
+        return _Worker(env, self.index)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"config": self.config, "index": self.index, "here": None}
+        return {**vars(self), "here": None}

@@ -12,7 +12,7 @@ import tyro
 from merl.agents import AGENTS
 from merl.agents.config import AgentConfig
 from merl.core import MerlError, check_choice
-from merl.envs.config import EnvConfig
+from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 
@@ -99,6 +99,9 @@ class TrainConfig:
     keep: int = 2
     """How many of the last checkpoints are kept, beside the best."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
+    user_env: Annotated[UserEnvConfig, tyro.conf.arg(name="env")] = field(
+        default_factory=UserEnvConfig
+    )
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     agent: AgentConfig = field(default_factory=lambda: AGENTS["merl"])
     eval: EvaluationConfig = field(default_factory=EvaluationConfig)

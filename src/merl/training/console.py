@@ -141,9 +141,9 @@ class ConsoleView:
     def _training(self) -> str:
         """Return and success of the last training episodes, noise and all."""
         values = f"return {mean(row['train/return'] for row in self._recent):.1f}"
-        ends = [row["train/success_end"] for row in self._recent if "train/success_end" in row]
-        if ends:
-            values += f", success {mean(ends):.0%}"
+        name = "train/success_end"
+        if any(name in row for row in self._recent):  # a row without it failed
+            values += f", success {mean(row.get(name, 0.0) for row in self._recent):.0%}"
         return f"{values} (last {len(self._recent)})"
 
 

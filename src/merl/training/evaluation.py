@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from merl.agents import make_agent
 from merl.core import Agent, MerlError, NotFinite, Observation, is_image
+from merl.envs.user_spaces import Modality
 from merl.statistics import Interval, bootstrap_interval, wilson_interval
 from merl.training.checkpoint import Checkpoint, load_networks
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, own_bounds, run_spaces
 from merl.training.guards import check_moment
-from merl.training.rollout import Episode, FrameStack
+from merl.training.rollout import Episode, FrameStack, report_success
 from merl.training.run import Run
 from merl.training.video import VideoWriter
 
@@ -43,6 +44,7 @@ class Policy:
     Attributes:
         config: of the run that it comes from.
         step: environment steps after which it was saved.
+        reports_success: the environment was known to report success by then.
     """
 
     def __init__(
@@ -53,10 +55,12 @@ class Policy:
         device: torch.device,
         step: int = 0,
         run: Run | None = None,
+        reports_success: bool = False,
     ) -> None:
         self.config, self.step, self._run = config, step, run
+        self.reports_success = reports_success
         self._agent = agent
-        self._space = {key: space[key] for key in agent.senses}
+        self._modalities = {key: _as_trained(key, space[key]) for key in agent.senses}
         images = tuple(key for key in agent.senses if is_image(space[key]))
         self._stack = FrameStack(config.replay.frame_stack, images, device)
         self._fresh = True
@@ -75,11 +79,11 @@ class Policy:
             float32 (A,), in [-1, 1].
 
         Raises:
-            MerlError: a key is missing or has another shape or type than the agent was trained
-                with.
-            NotFinite: a number of it is none.
+            MerlError: a key is missing, has another shape or type than the agent was trained
+                with, or cannot be converted to an array.
+            NotFinite: it holds NaN or infinity.
         """
-        sensed = {key: self._checked(key, observation) for key in self._space}
+        sensed = {key: self._checked(key, observation) for key in self._modalities}
         if self._fresh:
             self._stack.reset(sensed)
         else:
@@ -112,22 +116,16 @@ class Policy:
         return env
 
     def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
-        space = self._space[key]
+        if not isinstance(observation, Mapping):
+            raise MerlError(
+                f"the observation is of {type(observation).__name__}: a dict with "
+                f"{list(self._modalities)} is needed"
+            )
         if key not in observation:
             raise MerlError(
-                f"the observation lacks {key!r}: the agent consumes {list(self._space)}"
+                f"the observation lacks {key!r}: the agent consumes {list(self._modalities)}"
             )
-        value = np.asarray(observation[key])
-        if value.shape != space.shape:
-            raise MerlError(f"observation {key!r} has shape {value.shape}: {space.shape} is needed")
-        if is_image(space) and value.dtype != np.uint8:
-            raise MerlError(
-                f"observation {key!r} is of {value.dtype}: pixels from 0 to 255, uint8, are needed"
-            )
-        try:
-            value = value.astype(space.dtype, copy=False)
-        except (TypeError, ValueError):
-            raise MerlError(f"observation {key!r} holds what is no number") from None
+        value = self._modalities[key].convert(observation[key])
         if not np.isfinite(value).all():
             raise NotFinite(f"observation {key!r} holds a NaN or an infinity: {value}")
         return value
@@ -141,9 +139,10 @@ class Evaluation:
         episodes: one by one, in the order of their seeds.
         returns: the mean return with its bootstrap interval.
         success_end: the rate of success at the last step, with Wilson's interval; None where the
-            environment does not say.
+            environment does not report success.
         success_any: likewise, at any step.
-        success_share: the mean share of steps that are a success, with its bootstrap interval.
+        success_share: of the steps that report success or failure, the mean share of successes,
+            with its bootstrap interval.
     """
 
     episodes: tuple[Episode, ...]
@@ -183,6 +182,7 @@ def evaluate(
     video: Path | None = None,
     tick: Callable[[int], None] = lambda episode: None,
     warn: Callable[[str], None] | None = None,
+    reports_success: bool = False,
 ) -> Evaluation:
     """Run episodes from the evaluation's starts.
 
@@ -195,6 +195,7 @@ def evaluate(
         tick: called after every step, with the number of the episode; may raise to end it.
         warn: is told if the video cannot be made, and the evaluation goes on without it; without
             `warn` that is an error.
+        reports_success: the environment is known to report success, see `summarize`.
     """
     results = []
     for index in range(episodes):
@@ -208,19 +209,24 @@ def evaluate(
             warn(str(error))
             reset()
             results.append(_run_episode(act, env, index, None, tick))
-    return summarize(results)
+    return summarize(results, reports_success=reports_success)
 
 
-def summarize(episodes: list[Episode]) -> Evaluation:
-    """Means and intervals over episodes."""
-    told = [e for e in episodes if e.success is not None]  # the others do not speak of success
-    count = len(told)
+def summarize(episodes: list[Episode], *, reports_success: bool = False) -> Evaluation:
+    """Means and intervals over episodes.
+
+    Args:
+        episodes: one or more.
+        reports_success: the environment is known to report success: an episode without a report
+            failed. It is known in any case if one of these episodes has reported.
+    """
+    reports, count = reports_success or report_success(episodes), len(episodes)
     return Evaluation(
         tuple(episodes),
         bootstrap_interval([e.total_reward for e in episodes]),
-        wilson_interval(sum(bool(e.success) for e in told), count) if told else None,
-        wilson_interval(sum(e.successes > 0 for e in told), count) if told else None,
-        bootstrap_interval([e.successes / e.length for e in told]) if told else None,
+        wilson_interval(sum(bool(e.success) for e in episodes), count) if reports else None,
+        wilson_interval(sum(e.successes > 0 for e in episodes), count) if reports else None,
+        bootstrap_interval([e.success_share for e in episodes]) if reports else None,
     )
 
 
@@ -264,6 +270,12 @@ def _caption(episode: Episode) -> dict[str, str | float | bool | int]:
     return caption
 
 
+def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
+    """The check of an observation key that has the form which agents take already."""
+    assert isinstance(space, spaces.Box)
+    return Modality(key, space, space)
+
+
 def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:
     """The policy that a run has learnt.
 
@@ -289,4 +301,12 @@ def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:
         device=device,
     )
     load_networks(agent.networks, saved)
-    return Policy(agent, config, observation_space, device, step=saved.step, run=opened)
+    return Policy(
+        agent,
+        config,
+        observation_space,
+        device,
+        step=saved.step,
+        run=opened,
+        reports_success=saved.state()["progress"].get("reports_success", False),
+    )

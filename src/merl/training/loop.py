@@ -34,6 +34,7 @@ class Progress:
     episodes: int = 0
     evaluated: int = 0  # the step of the last evaluation
     restarts: int = 0  # of environments' processes
+    reports_success: bool = False  # an episode of the environment has reported success or failure
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from merl.core import MerlError
 from merl.replay import check_fits
 from merl.resources import available_memory, keep_freed_memory
 from merl.training.config import TrainConfig
-from merl.training.environment import make_run_env, run_spaces
+from merl.training.environment import EnvSpaces, make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness
 from merl.training.run import refuse_existing, run_path
 from merl.training.timing import measure, use_threads
@@ -108,6 +108,8 @@ class Parts:
             size = max(config.env.render_size, MIN_SIDE)
             eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)
             stack.callback(eval_env.close)
+            expected = EnvSpaces.of(config, env)
+            expected.check(EnvSpaces.of(config, eval_env), "the one that is evaluated in")
             yield cls(config, env, eval_env)
 
 

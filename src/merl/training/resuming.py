@@ -32,6 +32,8 @@ _LEFT_OPEN = {
     "threads": None,
     "agent.precision": "auto",
     "agent.torch_compile": "auto",
+    "agent.images": None,
+    "agent.vectors": None,
     "minutes": None,
 }
 """Values that ask for nothing: what the run has decided stays."""

@@ -31,6 +31,7 @@ from gymnasium import spaces
 
 import merl
 from merl.agents import AGENTS
+from merl.agents.networks import modalities
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
 from merl.envs.own import module_folder, search_first
 from merl.training.config import TrainConfig
@@ -112,7 +113,9 @@ class Run:
             if number != FORMAT:
                 raise MerlError(f"it has format {number}, this merl reads {FORMAT}")
             config = _read_config(record["config"])
-            _recorded_spaces(record)
+            observation_space, _ = _recorded_spaces(record)
+            if config.own_env and "user_env" not in record["config"]:
+                config = _naming_its_keys(config, observation_space)
             _last_machine(record)
             folder = record.get("module_folder")
             if folder is not None:  # so that the run works from wherever it is called
@@ -295,6 +298,13 @@ def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
     name = plain.get("agent_name", "merl")
     check_choice("agent", name, tuple(AGENTS))
     return from_plain(TrainConfig, plain, agent=type(AGENTS[name]))
+
+
+def _naming_its_keys(config: TrainConfig, space: spaces.Dict) -> TrainConfig:
+    """Name the keys of a run by an earlier merl, which left `state` out unless it was named."""
+    images, vectors = modalities(config.agent, space)
+    agent = dataclasses.replace(config.agent, images=images, vectors=vectors)
+    return dataclasses.replace(config, agent=agent)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from merl.training.meters import Averages, Clock, Interval
 from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
 from merl.training.plain import to_plain
-from merl.training.rollout import FrameStack, mean_metrics
+from merl.training.rollout import FrameStack, mean_metrics, report_success
 from merl.training.run import Run, resume_line
 from merl.training.signals import Interrupt
 from merl.training.updating import make_update
@@ -236,7 +236,10 @@ class Stretch:
         """A row of metrics for the episode that has ended."""
         self.guard.check()
         self.run.check_there()
-        values = {f"train/{k}": v for k, v in mean_metrics(moment.episodes).items()}
+        progress = self.parts.progress
+        progress.reports_success |= report_success(moment.episodes)
+        means = mean_metrics(moment.episodes, reports_success=progress.reports_success)
+        values = {f"train/{k}": v for k, v in means.items()}
         values |= self.averages.take()
         values |= self.clock.rates(self.parts.progress)
         values["replay/steps"] = float(len(self.replay))
@@ -260,11 +263,13 @@ class Stretch:
                 video=self.run.videos / f"{step:08d}.mp4" if film else None,
                 tick=self._evaluating,
                 warn=self.view.warn,
+                reports_success=parts.progress.reports_success,
             )
         except _Interrupted:
             return
         self.run.check_there()
         parts.progress.evaluated = step
+        parts.progress.reports_success |= self.evaluation.success_end is not None
         values = {f"eval/{name}": value for name, value in self.evaluation.metrics().items()}
         self.metrics.write(step, values | {"time/seconds": self.clock.seconds()})
         self.view.evaluated(step, self.evaluation)

@@ -337,12 +337,10 @@ class _Film:
         except Exception as error:  # of the user's `render`, of the encoder, of the disk
             self.abort()
             self._writer = None
-            why = str(error)
-            if not isinstance(error, MerlError):
-                why = f"the video {self._path} cannot be made: {in_one_line(error)}"
+            why = str(error) if isinstance(error, MerlError) else in_one_line(error)
             if self._warn is None:
-                raise MerlError(why) from error
-            self._warn(why)
+                raise MerlError(f"the video {self._path} cannot be made: {why}") from error
+            self._warn(f"there is no video of this evaluation: {why}")
 
 
 def _caption(episode: Episode) -> dict[str, Value]:

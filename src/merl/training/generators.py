@@ -80,6 +80,7 @@ def _restorers(env: gymnasium.Env[Any, Any]) -> Iterator[Callable[[], object]]:
             restore = _restorer(value)
             if restore is not None:
                 yield restore
+            if restore is not None or name == "_np_random":  # a space's is None until it is used
                 yield _reassign(owner, name, value)
 
 

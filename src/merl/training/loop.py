@@ -33,7 +33,7 @@ class Progress:
     updates: int = 0
     episodes: int = 0
     evaluated: int = 0  # the step of the last evaluation
-    failed: int = 0  # the step of the last evaluation that ended by an exception
+    failed: int = 0  # the step of the last evaluation, if it ended by an exception; else 0
     restarts: int = 0  # of environments' processes
 
 

@@ -291,8 +291,8 @@ class Stretch:
         """Evaluate, after a save: whatever the evaluation does, no training is lost.
 
         Raises:
-            EvaluationFailed: it ended by an exception. The resumed run repeats it, and continues
-                without it if it fails again.
+            EvaluationFailed: it ended by an exception. The resumed run repeats it, and from then on
+                leaves out those that fail, with a warning.
         """
         self._save()
         progress, before = self.parts.progress, self.evaluation
@@ -305,7 +305,7 @@ class Stretch:
                 self._fail(error)
             return
         self.run.check_there()
-        progress.evaluated = progress.step
+        progress.evaluated, progress.failed = progress.step, 0
         values = {f"eval/{name}": value for name, value in self.evaluation.metrics().items()}
         self.metrics.write(progress.step, values | {"time/seconds": self.clock.seconds()})
         self.view.evaluated(progress.step, self.evaluation)
@@ -336,14 +336,17 @@ class Stretch:
         )
 
     def _fail(self, error: Exception) -> None:
-        """Handle an evaluation's exception: end the run, or warn if that happened here before."""
+        """Handle an evaluation's exception: end the run, or warn if the last one failed, too.
+
+        A resumed run therefore does not end by the same failure again.
+        """
         self.run.check_there()
         progress = self.parts.progress
         why = str(error) if isinstance(error, MerlError) else in_one_line(error)
         told = f"the evaluation at step {progress.step:,} failed: {why}"
-        if progress.failed == progress.step:
-            progress.evaluated = progress.step
-            self.view.warn(f"{told}; it failed before, and is left out")
+        if progress.failed:
+            progress.failed = progress.evaluated = progress.step
+            self.view.warn(f"{told}, as the one before; the run goes on without it")
             return
         progress.failed = progress.step
         line = resume_line(self.run.path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -17,6 +18,7 @@ from unruly_envs import DEFAULT, unruly
 import merl
 from merl.cli import main
 from merl.report.curves import read_metrics
+from merl.training.evaluator import ATTEMPTS
 from merl.training.timing import Arithmetic, Timing
 
 _FLAGS = {
@@ -117,6 +119,29 @@ def test_a_run_whose_last_evaluation_failed_is_evaluated_when_resumed() -> None:
     assert merl.load_policy("run").step == 60
     assert main(["resume", "run"]) == 0
     assert evaluated() == [60]
+
+
+def test_an_evaluation_that_is_killed_again_and_again_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Killed(BaseException):
+        """Nobody handles it, as SIGKILL."""
+
+    def killed(env: Any, seen: Any) -> Any:
+        raise Killed
+
+    unruly.in_evaluation = killed
+    monkeypatch.setattr("merl.envs.adapted.failing", contextlib.nullcontext)
+    with pytest.raises(Killed):
+        train("--eval.every", "1000")
+    for _ in range(ATTEMPTS - 1):
+        with pytest.raises(Killed):
+            main(["resume", "run"])
+    assert main(["resume", "run"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "the evaluation at step 60 was begun 3 times and never finished" in said
+    assert main(["resume", "run"]) == 0
+    assert "is done" in capsys.readouterr().out
 
 
 def test_an_exception_of_merls_own_in_an_evaluation_is_one_line(

@@ -13,9 +13,9 @@ import torch
 
 from merl.core import MerlError
 from merl.envs.action_repeat import ActionRepeat
-from merl.training import evaluation
 from merl.training.evaluation import EVALUATION_SEED, evaluate
 from merl.training.generators import seed_global_generators
+from merl.training.video import VideoWriter
 from toy import DotEnv
 
 
@@ -82,7 +82,7 @@ def test_a_video_that_cannot_be_made_does_not_cost_the_evaluation(
     def full(*_: Any, **__: Any) -> None:
         raise MerlError("film.mp4 cannot be written: No space left on device")
 
-    monkeypatch.setattr(evaluation.VideoWriter, "add", full)
+    monkeypatch.setattr(VideoWriter, "add", full)
     plain = evaluate(still, DotEnv(), 3)
     told: list[str] = []
     result = evaluate(still, DotEnv(), 3, video=tmp_path / "film.mp4", warn=told.append)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from merl.training.acting import Here, _Worker
 from merl.training.environment import environment_state, set_environment_state
 from merl.training.generators import (
     global_state,
@@ -112,3 +113,19 @@ def test_an_environment_state_of_an_earlier_checkpoint_is_restored() -> None:
     set_environment_state(env, state)
     set_environment_state(env, None)
     assert env.np_random.normal() == expected
+
+
+def test_the_seed_of_an_episode_seeds_the_global_generators_of_its_process() -> None:
+    env = DotEnv()
+    for environment in (
+        lambda seed: Here(env).reset({0: seed}),
+        lambda seed: _Worker(env, 0).reset(seed=seed),
+    ):
+        seeded = []
+        for seed in (3, 4, 3):
+            environment(seed)
+            seeded.append(drawn())
+        assert seeded[0] == seeded[2] != seeded[1]
+        seed_global_generators(3)
+        environment(None)
+        assert drawn() == seeded[0]

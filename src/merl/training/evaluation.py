@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,17 +18,15 @@ from numpy.typing import NDArray
 
 from merl.agents import make_agent
 from merl.core import Agent, MerlError, NotFinite, Observation, is_image
-from merl.envs.adapted import in_one_line
-from merl.envs.frame_rate import frame_rate
 from merl.statistics import Interval, bootstrap_interval, wilson_interval
 from merl.training.checkpoint import Checkpoint, load_networks
 from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.environment import make_run_env, own_bounds, run_spaces
 from merl.training.generators import kept_generators, seed_global_generators
 from merl.training.guards import check_moment
+from merl.training.recording import EpisodeVideo, warn_user
 from merl.training.rollout import Episode, FrameStack
 from merl.training.run import Run
-from merl.training.video import FPS, Value, VideoWriter
 
 EVALUATION_SEED = 1_000_000
 """Episode i of every evaluation starts from `env.reset(seed=EVALUATION_SEED + i)`."""
@@ -214,21 +211,17 @@ def evaluate(
     with kept_generators(env):
         for index in range(episodes):
             reset()
-            film = _Film(video, env, warn) if video is not None and index == 0 else None
+            film = EpisodeVideo(video, env, warn) if video is not None and index == 0 else None
             episode, start, ended = _run_episode(act, env, index, film, tick, max_steps)
             results.append(episode)
             starts.append(start)
             if not ended:
-                (warn or _warn)(
+                (warn or warn_user)(
                     f"an episode of the evaluation was cut after {max_steps:,} steps and counts as "
                     "truncated: --eval.max-episode-steps sets the limit "
                     "(merl evaluate: --max-episode-steps)"
                 )
     return dataclasses.replace(summarize(results), starts=tuple(starts))
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, stacklevel=3)
 
 
 def summarize(episodes: list[Episode]) -> Evaluation:
@@ -248,7 +241,7 @@ def _run_episode(
     act: Act,
     env: gymnasium.Env[Any, Any],
     index: int,
-    film: _Film | None,
+    film: EpisodeVideo | None,
     tick: Callable[[int], None],
     max_steps: int,
 ) -> tuple[Episode, str, bool]:
@@ -265,7 +258,7 @@ def _run_episode(
             episode.add(float(reward), info)
             over = bool(terminated or truncated)
             if film is not None:
-                film.add(_caption(episode))
+                film.add(episode)
             tick(index)
         if film is not None:
             film.close()
@@ -280,77 +273,6 @@ def _digest(observation: Observation) -> str:
     for key in sorted(observation):
         digest.update(np.ascontiguousarray(observation[key]).tobytes())
     return digest.hexdigest()
-
-
-class _Film:
-    """The video of an episode: a failure ends the video, and never the episode.
-
-    Args:
-        path: where to write it.
-        env: is rendered for each frame.
-        warn: receives the reason of a failure; without it, a failure is an error.
-    """
-
-    def __init__(
-        self, path: Path, env: gymnasium.Env[Any, Any], warn: Callable[[str], None] | None
-    ) -> None:
-        self._path, self._env, self._warn = path, env, warn
-        rate = frame_rate(env.metadata)
-        if rate is None:
-            (warn or _warn)(
-                f"the environment's metadata has no usable render_fps: its videos have {FPS:g} "
-                "frames a second"
-            )
-        self._writer: VideoWriter | None = None
-        with self._failing():
-            self._writer = VideoWriter(path, fps=FPS if rate is None else rate)
-
-    def add(self, caption: Mapping[str, Value]) -> None:
-        """Append what the environment renders now.
-
-        Raises:
-            MerlError: the video cannot be made, and there is no `warn`.
-        """
-        if self._writer is not None:
-            with self._failing():
-                self._writer.add(np.asarray(self._env.render()), caption)
-
-    def close(self) -> None:
-        """Complete the video.
-
-        Raises:
-            MerlError: the video cannot be made, and there is no `warn`.
-        """
-        if self._writer is not None:
-            with self._failing():
-                self._writer.close()
-
-    def abort(self) -> None:
-        """Remove a video that is not complete."""
-        if self._writer is not None:
-            self._writer.abort()
-
-    @contextmanager
-    def _failing(self) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:  # of the user's `render`, of the encoder, of the disk
-            self.abort()
-            self._writer = None
-            why = str(error) if isinstance(error, MerlError) else in_one_line(error)
-            if self._warn is None:
-                raise MerlError(f"the video {self._path} cannot be made: {why}") from error
-            self._warn(f"there is no video of this evaluation: {why}")
-
-
-def _caption(episode: Episode) -> dict[str, Value]:
-    caption: dict[str, Value] = {
-        "step": episode.length,
-        "return": episode.total_reward,
-    }
-    if episode.success is not None:
-        caption["success"] = episode.success
-    return caption
 
 
 def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:

@@ -12,16 +12,14 @@ from typing import Any, Protocol
 from merl.core import (
     EnvironmentFailed,
     EnvironmentsLost,
-    EvaluationFailed,
-    MerlError,
     is_image,
 )
-from merl.envs.adapted import in_one_line
 from merl.replay import Lanes
 from merl.training import checkpoint
 from merl.training.acting import Environments, Lost
 from merl.training.checkpoint import Checkpoint
-from merl.training.evaluation import Evaluation, Policy, evaluate
+from merl.training.evaluation import Evaluation
+from merl.training.evaluator import Evaluations
 from merl.training.guards import LossGuard
 from merl.training.loop import Moment, Progress, Stage, train
 from merl.training.meters import Averages, Clock, Interval
@@ -79,10 +77,6 @@ class Outcome:
     saved: bool
 
 
-class _Interrupted(Exception):  # noqa: N818 (no error, a way out)
-    """An evaluation is to end before its time."""
-
-
 class Stretch:
     """One stretch of training, from start or resume to the end or an interruption."""
 
@@ -100,9 +94,10 @@ class Stretch:
         self.replay, self.environments = replay, environments
         self.metrics, self.view, self.interrupt = metrics, view, interrupt
         self.clock, self.averages, self.guard = Clock(), Averages(), LossGuard()
-        self.evaluation: Evaluation | None = None
+        self.evaluations = Evaluations(
+            parts, run, metrics, view, interrupt, self._save, lambda: self.clock.seconds()
+        )
         self.losses = 0
-        self._warned = set[str]()
         self._saved: dict[str, Any] | None = None  # the progress at the last save
         self._ended: int | None = None  # the last episode's step, until it is long ago
         self._states: Sequence[Mapping[str, Any] | None] = [None] * environments.count
@@ -155,7 +150,7 @@ class Stretch:
             self.view.warn("there will be no videos: the environment does not render to an array")
         if progress.step == 0:
             self._save()  # from here on there is something to go on from
-        elif self._evaluation_is_due() and not self.replay.state_dict()["open"]:
+        elif self.evaluations.are_due() and not self.replay.state_dict()["open"]:
             self._evaluate()  # the run was left before it or within it
             self._save()
         self.clock.mark(progress)
@@ -196,7 +191,7 @@ class Stretch:
 
     def _outcome(self, saved: bool) -> Outcome:
         number = self.interrupt.number
-        return Outcome(self.run, self.parts.progress, self.evaluation, number, saved)
+        return Outcome(self.run, self.parts.progress, self.evaluations.last, number, saved)
 
     def _resumes_exactly(self) -> bool:
         """Whether the checkpoint holds the state of the generators that Gymnasium gives."""
@@ -261,18 +256,11 @@ class Stretch:
         return spent or self.interrupt.number is not None
 
     def _at_episode_end(self) -> None:
-        if self._evaluation_is_due():
+        if self.evaluations.are_due():
             self._evaluate()
             self._save()
         elif self._interval.is_due():
             self._save()
-
-    def _evaluation_is_due(self) -> bool:
-        """Whether to evaluate before training continues; the last evaluation comes after it."""
-        progress, every = self.parts.progress, self.config.eval.every
-        if not every or progress.step >= self.config.steps:
-            return False
-        return progress.step // every > progress.evaluated // every
 
     def _log(self, moment: Moment) -> dict[str, float]:
         """A row of metrics for the episode that has ended."""
@@ -288,87 +276,8 @@ class Stretch:
         return values
 
     def _evaluate(self, last: bool = False) -> None:
-        """Evaluate, after a save: whatever the evaluation does, no training is lost.
-
-        Raises:
-            EvaluationFailed: it ended by an exception. The resumed run repeats it, and from then on
-                leaves out those that fail, with a warning.
-        """
-        self._save()
-        progress, before = self.parts.progress, self.evaluation
-        try:
-            self.evaluation = self._measured(last)
-        except _Interrupted:
-            return
-        except Exception as error:
-            if self.interrupt.number is None:
-                self._fail(error)
-            return
-        self.run.check_there()
-        progress.evaluated, progress.failed = progress.step, 0
-        values = {f"eval/{name}": value for name, value in self.evaluation.metrics().items()}
-        self.metrics.write(progress.step, values | {"time/seconds": self.clock.seconds()})
-        self.view.evaluated(progress.step, self.evaluation)
-        if before is not None and not self.evaluation.starts_as(before):
-            self._warn_once(
-                "the episodes of this evaluation do not start as those of the one before, with the "
-                "same seeds: the environment or a wrapper of it keeps state across resets, or does "
-                "not follow its seed"
-            )
-        self.clock.mark(progress)  # evaluating is not counted against the speed
-
-    def _measured(self, last: bool) -> Evaluation:
-        """Run the episodes of an evaluation."""
-        parts, config = self.parts, self.config.eval
-        step = parts.progress.step
-        assert parts.eval_env is not None
-        policy = Policy(parts.agent, self.config, parts.space, parts.device, step)
-        film = parts.films and (config.video == "each" or (config.video == "last" and last))
-        return evaluate(
-            policy,
-            parts.eval_env,
-            config.episodes,
-            reset=policy.reset,
-            video=self.run.videos / f"{step:08d}.mp4" if film else None,
-            tick=self._evaluating,
-            warn=self._warn_once,
-            max_steps=self.config.eval_steps,
-        )
-
-    def _fail(self, error: Exception) -> None:
-        """Handle an evaluation's exception: end the run, or warn if the last one failed, too.
-
-        A resumed run therefore does not end by the same failure again.
-        """
-        self.run.check_there()
-        progress = self.parts.progress
-        why = str(error) if isinstance(error, MerlError) else in_one_line(error)
-        told = f"the evaluation at step {progress.step:,} failed: {why}"
-        if progress.failed:
-            progress.failed = progress.evaluated = progress.step
-            self.view.warn(f"{told}, as the one before; the run goes on without it")
-            return
-        progress.failed = progress.step
-        line = resume_line(self.run.path)
-        saved = f"the run is saved at that step: mend it, and go on with `{line}`"
-        if not self._save():
-            saved = f"go on from the last checkpoint with `{line}`"
-        failure = EvaluationFailed(f"{told}; {saved}")
-        if isinstance(error, MerlError):
-            failure.exit_code = error.exit_code
-        raise failure from error
-
-    def _warn_once(self, message: str) -> None:
-        """Warn, unless the same was said before: each evaluation would repeat it."""
-        if message not in self._warned:
-            self._warned.add(message)
-            self.view.warn(message)
-
-    def _evaluating(self, episode: int) -> None:
-        """Between two steps of an evaluation; it ends at once if the run is to stop."""
-        if self.interrupt.number is not None:
-            raise _Interrupted
-        self.view.evaluating(episode, self.config.eval.episodes)
+        self.evaluations.run(last)
+        self.clock.mark(self.parts.progress)  # evaluating is not counted against the speed
 
     def _environment_states(self) -> Sequence[Mapping[str, Any] | None]:
         """Return the states of the environments; of those that are lost, the last known."""
@@ -395,7 +304,8 @@ class Stretch:
         parts, progress = self.parts, self.parts.progress
         if self._saved == dataclasses.asdict(progress):
             return True
-        fresh = self.evaluation is not None and progress.evaluated == progress.step
+        last = self.evaluations.last
+        fresh = last is not None and progress.evaluated == progress.step
         state = {
             "progress": dataclasses.asdict(progress),
             "randomness": parts.randomness.state_dict(),
@@ -412,7 +322,7 @@ class Stretch:
                 progress.step,
                 parts.agent,
                 state,
-                score=self.evaluation.returns.mean if fresh and self.evaluation else None,
+                score=last.returns.mean if fresh and last else None,
                 keep=self.config.keep,
             )
         except OSError as error:

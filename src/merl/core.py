@@ -64,6 +64,12 @@ class EnvironmentFailed(MerlError):  # noqa: N818 (what happened, not a mistake)
     exit_code = 4
 
 
+class EvaluationFailed(MerlError):  # noqa: N818 (what happened, not a mistake)
+    """An evaluation ended by an exception: the run was saved before it, and can be resumed."""
+
+    exit_code = 4
+
+
 def meant(name: str, known: Iterable[str]) -> str:
     """The way out of a name that is unknown: what was perhaps meant, or all that there is."""
     close = get_close_matches(name, list(known), n=1)

@@ -1,15 +1,17 @@
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 
 import pytest
 
-from merl.training.signals import Interrupt
+from merl.training.signals import Interrupt, handlers_kept
 
 
 @pytest.fixture(autouse=True)
@@ -94,3 +96,49 @@ def test_where_no_thread_is_to_be_had_it_is_a_wish_all_the_same(
     with Interrupt().listening() as interrupt:
         os.kill(os.getpid(), signal.SIGTERM)
         assert interrupt.number == signal.SIGTERM
+
+
+SIGINT_TAKEN_OVER = {
+    "by Python": lambda: signal.signal(signal.SIGINT, lambda *_: None),
+    "by Python, ignored": lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    "by a C library": lambda: ctypes.CDLL(None).signal(int(signal.SIGINT), ctypes.c_void_p(1)),
+}
+
+
+@pytest.mark.parametrize("how", SIGINT_TAKEN_OVER)
+def test_a_handler_that_is_taken_over_is_put_back(how: str) -> None:
+    former = signal.getsignal(signal.SIGINT)
+    with Interrupt().listening() as interrupt:
+        with handlers_kept():
+            SIGINT_TAKEN_OVER[how]()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert interrupt.number == signal.SIGINT
+    assert signal.getsignal(signal.SIGINT) == former
+
+
+def test_a_signal_that_another_handler_took_is_noted() -> None:
+    taken: list[int] = []
+    with Interrupt().listening() as interrupt:
+        with handlers_kept():
+            signal.signal(signal.SIGINT, lambda number, _: taken.append(number))
+            os.kill(os.getpid(), signal.SIGUSR1)  # merl's own
+            os.kill(os.getpid(), signal.SIGINT)
+        assert taken == [signal.SIGINT]
+        assert interrupt.number == signal.SIGUSR1
+    with Interrupt().listening() as interrupt:
+        with handlers_kept():
+            signal.signal(signal.SIGINT, lambda number, _: taken.append(number))
+            os.kill(os.getpid(), signal.SIGINT)
+        assert interrupt.number == signal.SIGINT
+
+
+def test_handlers_are_left_alone_in_another_thread() -> None:
+    def call() -> None:
+        with handlers_kept():
+            done.append(True)
+
+    done: list[bool] = []
+    thread = threading.Thread(target=call)
+    thread.start()
+    thread.join()
+    assert done == [True]

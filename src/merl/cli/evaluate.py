@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,9 @@ class EvaluateOptions:
     """How many episodes."""
     video: Path | None = None
     """Film the first episode into this file (MP4)."""
+    max_episode_steps: int | None = None
+    """Steps after which an episode is cut; as the run has it (--eval.max-episode-steps), if not
+    set."""
     checkpoint: str = "latest"
     """latest, best (by evaluation return), or a number of steps."""
     renderer: RendererName | None = None
@@ -42,6 +46,8 @@ class EvaluateOptions:
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise MerlError(f"--episodes must be at least 1, not {self.episodes}")
+        if self.max_episode_steps is not None and self.max_episode_steps < 1:
+            raise MerlError(f"--max-episode-steps must be at least 1, not {self.max_episode_steps}")
         if self.video is not None and self.video.suffix.lower() not in ("", ".mp4"):
             raise MerlError(
                 f"--video {self.video}: videos are MP4; use {self.video.with_suffix('.mp4')}"
@@ -51,7 +57,9 @@ class EvaluateOptions:
 def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
     options = parse(EvaluateOptions, "merl evaluate", args)
-    check_writable(options.json)
+    # Absolute before any user code runs, which may change the working folder.
+    file, film = _absolute(options.json), _absolute(options.video)
+    check_writable(file)
     console = Console(markup=False)
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     # As the run had it: several threads wait for each other where the machine does other work, too.
@@ -61,13 +69,18 @@ def evaluate(args: list[str]) -> int:
         size = max(policy.config.env.render_size, MIN_SIDE)
         changes |= {"render_mode": "rgb_array", "render_size": size}
     env = policy.make_env(**changes)
+    config = policy.config
+    if options.max_episode_steps is not None:
+        limited = dataclasses.replace(config.eval, max_episode_steps=options.max_episode_steps)
+        config = dataclasses.replace(config, eval=limited)
     try:
         result = evaluate_policy(
             policy,
             env,
             options.episodes,
             reset=policy.reset,
-            video=options.video,
+            video=film,
+            max_steps=config.eval_steps,
             reports_success=policy.reports_success,
         )
     finally:
@@ -76,13 +89,12 @@ def evaluate(args: list[str]) -> int:
     pictures = f"{seen} pictures" if seen else ""
     told = f"{options.run} at step {policy.step:,}{pictures}: {describe(result)}"
     console.print(told, highlight=False)
-    config = policy.config
     beside = references(config.task, config.env)
     if beside:
         console.print(comparison(config.task, result, beside), highlight=False)
     if options.video is not None:
         console.print(f"video: {options.video}", highlight=False, soft_wrap=True)
-    if options.json is not None:
+    if file is not None:
         rows = [
             {
                 "seed": EVALUATION_SEED + i,
@@ -90,5 +102,9 @@ def evaluate(args: list[str]) -> int:
             }
             for i, episode in enumerate(result.episodes)
         ]
-        write_json(options.json, {"run": str(options.run), "step": policy.step, "episodes": rows})
+        write_json(file, {"run": str(options.run), "step": policy.step, "episodes": rows})
     return 0
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else path.absolute()

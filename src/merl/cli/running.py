@@ -55,7 +55,8 @@ def go_on(run: Run, asked: TrainConfig) -> int:
         state = start.state()
         if config.steps < min(start.step, run.config.steps):
             raise MerlError(f"--steps {config.steps} is less than the {start.step:,} already taken")
-        if start.step >= config.steps and state["progress"]["evaluated"] == start.step:
+        evaluated = not config.eval.every or state["progress"]["evaluated"] == start.step
+        if start.step >= config.steps and evaluated:
             steps = f"{start.step:,} of {config.steps:,} steps"
             print(f"{run.path} is done: {steps}; --steps N takes it further")
             return 0

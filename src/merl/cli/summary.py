@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from merl.core import MerlError
+from merl.envs.adapted import in_one_line
 from merl.report.figures import learning_curve
 from merl.report.references import Reference, references
 from merl.training.config import TrainConfig
@@ -24,26 +25,33 @@ ENOUGH = 5
 
 
 def summarize(outcome: Outcome, console: Console) -> None:
-    """Print the table, draw the curve, say plainly what was learnt, and how to go on."""
+    """Print the table, draw the curve, say plainly what was learnt, and how to go on.
+
+    The run is saved: what fails here is told in one line, and the rest goes on.
+    """
     run, trained = outcome.run, outcome.evaluation
-    if trained is None:
-        return
     beside = references(run.config.task, run.config.env)
-    if not beside and run.config.eval.references:
+    if trained is not None and not beside and run.config.eval.references:
         with console.status(f"what {' and '.join(FLOORS)} are paid, to compare with"):
             beside = _measured(run.config, console, trained.success_end is not None)
-    console.print()
-    console.print(comparison(run.config.task, trained, beside))
+    if trained is not None:
+        console.print()
+        console.print(comparison(run.config.task, trained, beside))
     lines = {reference.name: reference.returns.mean for reference in beside}
     try:
         curve = learning_curve(run.path, run.path / "curve.png", references=lines)
         console.print(f"learning curve: {curve}", highlight=False, soft_wrap=True)
-    except MerlError as error:
-        console.print(f"the curve was not drawn: {error}", highlight=False)
+    except Exception as error:  # of matplotlib, too
+        console.print(f"the curve was not drawn: {_reason(error)}", highlight=False)
     videos = sorted(run.videos.glob("*.mp4")) if run.videos.is_dir() else []
     if videos:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
-    console.print(_verdict(beside, trained, outcome.progress.updates), highlight=False)
+    if trained is not None:
+        console.print(_verdict(beside, trained, outcome.progress.updates), highlight=False)
+    else:
+        console.print(
+            f"{run.path} is trained and saved, and not evaluated", highlight=False, soft_wrap=True
+        )
     console.print(_way_on(outcome), highlight=False, soft_wrap=True)
     console.print(
         f"(its replay, {run.replay}, is only needed to go on, and may be deleted otherwise)",
@@ -66,8 +74,10 @@ def floors(
         lambda _: np.zeros(shape, np.float32),
     )
     try:
+        limit = config.eval_steps
         results = [
-            evaluate(act, env, episodes, reports_success=reports_success) for act in policies
+            evaluate(act, env, episodes, max_steps=limit, reports_success=reports_success)
+            for act in policies
         ]
     finally:
         env.close()
@@ -100,9 +110,14 @@ def _measured(
     """What can be measured of the references that need no skill; the run is over in any case."""
     try:
         return floors(config, reports_success=reports_success)
-    except MerlError as error:
-        console.print(f"there is nothing to compare with: {error}", highlight=False)
+    except Exception as error:
+        console.print(f"there is nothing to compare with: {_reason(error)}", highlight=False)
         return ()
+
+
+def _reason(error: Exception) -> str:
+    """An exception in one line."""
+    return str(error) if isinstance(error, MerlError) else in_one_line(error)
 
 
 def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> str:

@@ -30,6 +30,7 @@ from merl.training.environment import (
     make_run_env,
     set_environment_state,
 )
+from merl.training.generators import seed_global_generators
 
 _INFO = ("success", "reward_terms")
 """What the loop wants to know beside the reward."""
@@ -74,6 +75,8 @@ class Environments(Protocol):
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
         """Start an episode in each environment named, with its seed if it has one.
 
+        A seed also seeds the global generators of the process that the environment lives in.
+
         Raises:
             Lost: a process died.
         """
@@ -95,8 +98,8 @@ class Environments(Protocol):
         """
         ...
 
-    def states(self) -> list[dict[str, Any] | None]:
-        """Where each one's random numbers stand, as plain types; None if it does not tell."""
+    def states(self) -> list[dict[str, Any]]:
+        """Return `environment_state()` of each one."""
         ...
 
     def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
@@ -132,7 +135,12 @@ class Here:
 
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
         """See `Environments`."""
-        return {index: self._env.reset(seed=seed)[0] for index, seed in seeds.items()}
+        observations = {}
+        for index, seed in seeds.items():
+            if seed is not None:
+                seed_global_generators(seed)
+            observations[index] = self._env.reset(seed=seed)[0]
+        return observations
 
     def send(self, actions: NDArray[np.float32]) -> None:
         """See `Environments`."""
@@ -143,7 +151,7 @@ class Here:
         observation, reward, terminated, truncated, info = self._env.step(self._action)
         return [Step(observation, float(reward), terminated, truncated, info)]
 
-    def states(self) -> list[dict[str, Any] | None]:
+    def states(self) -> list[dict[str, Any]]:
         """See `Environments`."""
         return [environment_state(self._env)]
 
@@ -214,7 +222,7 @@ class Workers:
             for index in range(self.count)
         ]
 
-    def states(self) -> list[dict[str, Any] | None]:
+    def states(self) -> list[dict[str, Any]]:
         """See `Environments`."""
         return [*self._call("state")]
 
@@ -326,6 +334,8 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._index = index
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        if options.get("seed") is not None:
+            seed_global_generators(options["seed"])
         with _errors_that_arrive():
             observation, _ = self.env.reset(**options)
         return observation, {}
@@ -337,7 +347,7 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
         # In a tuple, lest Gymnasium merge it with what the other environments tell.
         return observation, reward, terminated, truncated, {_TOLD: (told,)}
 
-    def state(self) -> dict[str, Any] | None:
+    def state(self) -> dict[str, Any]:
         with _errors_that_arrive():
             return environment_state(self.env)
 

@@ -29,9 +29,12 @@ class EvaluationConfig:
     """How often the agent shows what it has learnt: without noise, on the same fixed starts."""
 
     every: int = 10_000
-    """Steps between evaluations."""
+    """Steps between evaluations; 0 for none, at the end neither: then the environment is made only
+    once, as a single device needs it."""
     episodes: int = 10
     """Episodes of each evaluation."""
+    max_episode_steps: int = 2000
+    """Steps after which an episode of an evaluation is cut, if it has not ended by itself."""
     video: Literal["each", "last", "none"] = "each"
     """Which evaluations to film (their first episode)."""
     references: bool = True
@@ -39,9 +42,14 @@ class EvaluationConfig:
     compare with; not with an arm that must not flail (--eval.no-references)."""
 
     def __post_init__(self) -> None:
-        for name in ("every", "episodes"):
-            if getattr(self, name) < 1:
-                raise MerlError(f"eval.{name} must be at least 1, not {getattr(self, name)}")
+        for name, least in (("every", 0), ("episodes", 1), ("max_episode_steps", 1)):
+            if getattr(self, name) < least:
+                flag = name.replace("_", "-")
+                raise MerlError(f"eval.{flag} must be at least {least}, not {getattr(self, name)}")
+
+    def count(self, steps: int) -> int:
+        """Return how many evaluations a run of so many steps has."""
+        return max(1, steps // self.every) if self.every else 0
 
 
 @dataclass(frozen=True)
@@ -95,7 +103,8 @@ class TrainConfig:
     worker_timeout: float = 30.0
     """Seconds in which an environment's process has to answer."""
     save_every: float = 300.0
-    """Seconds between checkpoints; each waits for the end of an episode."""
+    """Seconds between checkpoints; each waits for the end of an episode, unless that takes much
+    longer."""
     keep: int = 2
     """How many of the last checkpoints are kept, beside the best."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
@@ -153,6 +162,11 @@ class TrainConfig:
     def has_workers(self) -> bool:
         """Whether environments act in processes of their own."""
         return self.num_envs > 1 or not self.synchronous
+
+    @property
+    def eval_steps(self) -> int:
+        """Actions after which an episode of an evaluation is cut; each may be held for steps."""
+        return math.ceil(self.eval.max_episode_steps / self.action_repeat)
 
     @property
     def capacity(self) -> int:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -22,6 +23,9 @@ from merl.envs.config import OBSERVATIONS, EnvConfig
 from merl.envs.own import make_own
 from merl.envs.user_spaces import brief
 from merl.training.config import TrainConfig
+from merl.training.env_checks import refuse_running_statistics
+from merl.training.generators import global_state, set_global_state
+from merl.training.signals import handlers_kept
 
 
 def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
@@ -41,7 +45,9 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
                 f"{', '.join(changes)} is for merl's own tasks: {config.task} decides for itself "
                 "how it is seen"
             )
-        env = make_own(config.task, render_mode, config.user_env)
+        with handlers_kept():
+            env = Supervised(make_own(config.task, render_mode, config.user_env))
+        refuse_running_statistics(env)
     else:
         seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))
         settings = {name: getattr(seen, name) for name in type(seen).__dataclass_fields__}
@@ -54,6 +60,38 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
         env.close()
         raise
     return env if consumed == env.observation_space else FilterObservation(env, tuple(consumed))
+
+
+class Supervised(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A user's environment, after each of whose calls the signal handlers are put back.
+
+    Simulators and drivers install handlers of their own, which would swallow Ctrl-C.
+    """
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; see `gymnasium.Env.reset`."""
+        with handlers_kept():
+            return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Take an action; see `gymnasium.Env.step`."""
+        with handlers_kept():
+            return self.env.step(action)
+
+    def render(self) -> Any:
+        """See `gymnasium.Env.render`."""
+        with handlers_kept():
+            return self.env.render()
+
+    def close(self) -> None:
+        """Close it; Ctrl-C gives up waiting for that, and what follows goes on."""
+        try:
+            with handlers_kept():
+                self.env.close()
+        except KeyboardInterrupt:
+            warnings.warn("closing the environment was interrupted", stacklevel=1)
 
 
 def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Box]:
@@ -178,27 +216,34 @@ def _size(space: spaces.Space[Any]) -> str:
     return "1 number" if space.shape == (1,) else f"{space.shape[0]} numbers"
 
 
-def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
-    """Where the environment's random numbers stand, as plain types; None if it does not tell.
+def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return the state of the generators that an environment draws from, as plain types.
 
-    Without it a run that is resumed meets other episodes than it would have met.
+    Returns:
+        The state of the environment's `np_random` (`bit_generator` is one of its keys), empty if
+        the environment does not use it, and under `globals` that of the process's global
+        generators. An environment with other generators meets other episodes after a resume.
     """
-    # Gymnasium's `np_random` makes a generator for whoever asks, this is one that is in use.
+    state: dict[str, Any] = {}
+    # Gymnasium's `np_random` makes a generator on access; this attribute is one that is in use.
     generator = getattr(env.unwrapped, "_np_random", None)
-    if not isinstance(generator, np.random.Generator):
-        return None
-    state: dict[str, Any] = dict(generator.bit_generator.state)
-    try:
-        json.dumps(state)
-    except TypeError:
-        return None
-    return state
+    if isinstance(generator, np.random.Generator):
+        state = dict(generator.bit_generator.state)
+        try:
+            json.dumps(state)
+        except TypeError:
+            state = {}
+    return state | {"globals": global_state()}
 
 
 def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any] | None) -> None:
-    """Have the environment's random numbers go on from what `environment_state` told."""
-    if state is not None:
-        env.unwrapped.np_random.bit_generator.state = state
+    """Restore from `environment_state()`."""
+    own = dict(state or {})
+    shared = own.pop("globals", None)
+    if shared is not None:
+        set_global_state(shared)
+    if own:
+        env.unwrapped.np_random.bit_generator.state = own
 
 
 def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:

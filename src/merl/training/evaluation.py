@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,18 +21,16 @@ from merl.core import Agent, MerlError, NotFinite, Observation, is_image
 from merl.envs.user_spaces import Modality
 from merl.statistics import Interval, bootstrap_interval, wilson_interval
 from merl.training.checkpoint import Checkpoint, load_networks
-from merl.training.config import TrainConfig
+from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.environment import make_run_env, own_bounds, run_spaces
+from merl.training.generators import kept_generators, seed_global_generators
 from merl.training.guards import check_moment
+from merl.training.recording import EpisodeVideo, warn_user
 from merl.training.rollout import Episode, FrameStack, report_success
 from merl.training.run import Run
-from merl.training.video import VideoWriter
 
 EVALUATION_SEED = 1_000_000
 """Episode i of every evaluation starts from `env.reset(seed=EVALUATION_SEED + i)`."""
-
-LONGEST = 100_000
-"""Steps of an episode of an evaluation, lest one that never ends be waited for."""
 
 Act = Callable[[Observation], NDArray[np.float32]]
 
@@ -143,6 +142,7 @@ class Evaluation:
         success_any: likewise, at any step.
         success_share: of the steps that report success or failure, the mean share of successes,
             with its bootstrap interval.
+        starts: a digest of each episode's first observation.
     """
 
     episodes: tuple[Episode, ...]
@@ -150,6 +150,11 @@ class Evaluation:
     success_end: Interval | None
     success_any: Interval | None
     success_share: Interval | None
+    starts: tuple[str, ...] = ()
+
+    def starts_as(self, other: Evaluation) -> bool:
+        """Whether the episodes start as those of another evaluation, as far as both go."""
+        return all(mine == its for mine, its in zip(self.starts, other.starts, strict=False))
 
     def metrics(self) -> dict[str, float]:
         """By name, as they stand in `metrics.csv` (behind `eval/`)."""
@@ -182,9 +187,10 @@ def evaluate(
     video: Path | None = None,
     tick: Callable[[int], None] = lambda episode: None,
     warn: Callable[[str], None] | None = None,
+    max_steps: int = EvaluationConfig.max_episode_steps,
     reports_success: bool = False,
 ) -> Evaluation:
-    """Run episodes from the evaluation's starts.
+    """Run episodes from the evaluation's starts; random generators are left as they were.
 
     Args:
         act: observation to action.
@@ -193,23 +199,31 @@ def evaluate(
         reset: called before each episode.
         video: where to film the first episode.
         tick: called after every step, with the number of the episode; may raise to end it.
-        warn: is told if the video cannot be made, and the evaluation goes on without it; without
-            `warn` that is an error.
+        warn: receives warnings (default: Python's). If the video cannot be made, the evaluation
+            goes on without it and warns; without `warn` that is an error.
+        max_steps: steps after which an episode is cut, as by a time limit, with a warning.
         reports_success: the environment is known to report success, see `summarize`.
+
+    Raises:
+        MerlError: the environment failed, or the video could not be made and `warn` is None.
+        NotFinite: a reward or an observation is NaN or infinite.
     """
-    results = []
-    for index in range(episodes):
-        reset()
-        film = video if index == 0 else None
-        try:
-            results.append(_run_episode(act, env, index, film, tick))
-        except MerlError as error:
-            if film is None or warn is None:
-                raise
-            warn(str(error))
+    results, starts = [], []
+    with kept_generators(env):
+        for index in range(episodes):
             reset()
-            results.append(_run_episode(act, env, index, None, tick))
-    return summarize(results, reports_success=reports_success)
+            film = EpisodeVideo(video, env, warn) if video is not None and index == 0 else None
+            episode, start, ended = _run_episode(act, env, index, film, tick, max_steps)
+            results.append(episode)
+            starts.append(start)
+            if not ended:
+                (warn or warn_user)(
+                    f"an episode of the evaluation was cut after {max_steps:,} steps and counts as "
+                    "truncated: --eval.max-episode-steps sets the limit "
+                    "(merl evaluate: --max-episode-steps)"
+                )
+    summary = summarize(results, reports_success=reports_success)
+    return dataclasses.replace(summary, starts=tuple(starts))
 
 
 def summarize(episodes: list[Episode], *, reports_success: bool = False) -> Evaluation:
@@ -234,40 +248,38 @@ def _run_episode(
     act: Act,
     env: gymnasium.Env[Any, Any],
     index: int,
-    video: Path | None,
+    film: EpisodeVideo | None,
     tick: Callable[[int], None],
-) -> Episode:
+    max_steps: int,
+) -> tuple[Episode, str, bool]:
+    """Run one episode; return it, the digest of its start, and whether it ended by itself."""
     episode, over = Episode(), False
-    observation, _ = env.reset(seed=EVALUATION_SEED + index)
-    with ExitStack() as stack:
-        film = None
-        if video is not None:
-            fps = env.metadata.get("render_fps", 25)
-            film = stack.enter_context(VideoWriter(video, fps=fps))
-        while not over:
+    seed = EVALUATION_SEED + index
+    seed_global_generators(seed)
+    observation, _ = env.reset(seed=seed)
+    start = _digest(observation)
+    try:
+        while not over and episode.length < max_steps:
             observation, reward, terminated, truncated, info = env.step(act(observation))
             check_moment(observation, float(reward), episode.length + 1, "of an evaluation")
             episode.add(float(reward), info)
-            over = terminated or truncated
-            if episode.length >= LONGEST and not over:
-                raise MerlError(
-                    f"an episode of the evaluation is not over after {LONGEST:,} steps: give the "
-                    "environment a limit, gymnasium.wrappers.TimeLimit"
-                )
+            over = bool(terminated or truncated)
             if film is not None:
-                film.add(np.asarray(env.render()), _caption(episode))
+                film.add(episode)
             tick(index)
-    return episode
+        if film is not None:
+            film.close()
+    finally:
+        if film is not None:
+            film.abort()  # without effect on one that is complete
+    return episode, start, over
 
 
-def _caption(episode: Episode) -> dict[str, str | float | bool | int]:
-    caption: dict[str, str | float | bool | int] = {
-        "step": episode.length,
-        "return": episode.total_reward,
-    }
-    if episode.success is not None:
-        caption["success"] = episode.success
-    return caption
+def _digest(observation: Observation) -> str:
+    digest = hashlib.sha256()
+    for key in sorted(observation):
+        digest.update(np.ascontiguousarray(observation[key]).tobytes())
+    return digest.hexdigest()
 
 
 def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:

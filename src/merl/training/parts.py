@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -20,6 +21,7 @@ from merl.core import MerlError
 from merl.replay import check_fits
 from merl.resources import available_memory, keep_freed_memory
 from merl.training.config import TrainConfig
+from merl.training.env_checks import check_instances
 from merl.training.environment import EnvSpaces, make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness
 from merl.training.run import refuse_existing, run_path
@@ -34,7 +36,8 @@ class Parts:
         config: with `device`, `threads`, the agent's `precision` and `torch_compile` decided.
         timing: what this machine needs for a step and an update.
         env: to act in.
-        eval_env: to be evaluated in.
+        eval_env: to be evaluated in; None where there are no evaluations (`eval.every` is 0).
+        home: the working folder at the start, which a relative run folder lies in.
         films: whether that can be filmed.
         space: what the agent consumes.
         action_space: what it does.
@@ -44,15 +47,23 @@ class Parts:
     """
 
     def __init__(
-        self, config: TrainConfig, env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, Any]
+        self,
+        config: TrainConfig,
+        env: gymnasium.Env[Any, Any],
+        eval_env: gymnasium.Env[Any, Any] | None,
+        home: Path,
     ) -> None:
-        self.env, self.eval_env = env, eval_env
-        self.films = eval_env.render_mode == "rgb_array"
+        self.env, self.eval_env, self.home = env, eval_env, home
+        self.films = eval_env is not None and eval_env.render_mode == "rgb_array"
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
         check_memory(config, self.space, self.action_space)
         keep_freed_memory()
-        self.timing = measure(config, env, eval_env, self.space, self.device)
+        # Without evaluations there are no videos whose frames could be timed.
+        timed = config
+        if eval_env is None:
+            timed = dataclasses.replace(config, eval=dataclasses.replace(config.eval, video="none"))
+        self.timing = measure(timed, env, eval_env or env, self.space, self.device)
         best = self.timing.best
         use_threads(best.threads)
         self.config = dataclasses.replace(
@@ -90,8 +101,9 @@ class Parts:
                 f"threads is {config.threads}, but this machine has {processors} processors: "
                 f"give at most {processors}"
             )
+        home = Path.cwd()  # before any user code runs, which may change it
         if new:
-            refuse_existing(run_path(config))
+            refuse_existing(run_path(config, home))
         with ExitStack() as stack:
             env = make_run_env(config)
             stack.callback(env.close)
@@ -101,16 +113,20 @@ class Parts:
                     config.replay,
                     space,
                     actions,
-                    directory=run_path(config),
+                    directory=run_path(config, home),
                     capacity=config.capacity,
                     lanes=config.num_envs,
                 )
-            size = max(config.env.render_size, MIN_SIDE)
-            eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)
-            stack.callback(eval_env.close)
-            expected = EnvSpaces.of(config, env)
-            expected.check(EnvSpaces.of(config, eval_env), "the one that is evaluated in")
-            yield cls(config, env, eval_env)
+            eval_env = None
+            if config.eval.every:
+                size = max(config.env.render_size, MIN_SIDE)
+                eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)
+                stack.callback(eval_env.close)
+                expected = EnvSpaces.of(config, env)
+                expected.check(EnvSpaces.of(config, eval_env), "the one that is evaluated in")
+                if config.own_env:
+                    check_instances(env, eval_env)
+            yield cls(config, env, eval_env, home)
 
 
 def choose_device(name: str) -> torch.device:

@@ -21,6 +21,7 @@ HARMLESS = (
     "env.render_size",
     "eval.every",
     "eval.episodes",
+    "eval.max_episode_steps",
     "eval.video",
     "eval.references",
     "agent.precision",

@@ -58,6 +58,8 @@ class Run:
         observation_space: spaces.Dict,
         action_space: spaces.Box,
         bounds: Bounds | None = None,
+        *,
+        home: Path | None = None,
     ) -> Run:
         """Make the folder and record what is run.
 
@@ -66,11 +68,12 @@ class Run:
             observation_space: what the agent consumes.
             action_space: what it does, in [-1, 1].
             bounds: of the environment's own actions, where they were rescaled.
+            home: see `run_path`.
 
         Raises:
             MerlError: the folder exists, or cannot be made.
         """
-        path = run_path(config)
+        path = run_path(config, home)
         refuse_existing(path)
         record = {
             "format": FORMAT,
@@ -107,6 +110,7 @@ class Run:
         Raises:
             MerlError: the folder is not a run's.
         """
+        path = path.absolute()  # user code may change the working folder
         with _readable(path):
             record = _read(path)
             number = record["format"]
@@ -257,15 +261,25 @@ class Run:
             return _recorded_spaces(_read(self.path))
 
 
-def run_path(config: TrainConfig) -> Path:
-    """The folder that a config names, or the first of the default ones that is free."""
+def run_path(config: TrainConfig, home: Path | None = None) -> Path:
+    """Return the folder that a config names, or the first of the default ones that is free.
+
+    Args:
+        config: of the run.
+        home: where a relative folder lies; the working folder if None.
+
+    Returns:
+        An absolute path.
+    """
+    home = Path.cwd() if home is None else home
     if config.run_dir is not None:
-        return config.run_dir
+        return home / config.run_dir
     agent = config.agent_name if config.setting == "matched" else f"{config.agent_name}-published"
     task = re.sub(r"[^\w.-]+", "-", config.task)  # `module:function`, `namespace/Id-v0`
     name = f"{task}-{agent}-{config.preset}-s{config.seed}"
-    numbered = (Path("runs") / f"{name}-{number}" for number in itertools.count(2))
-    return next(p for p in itertools.chain([Path("runs") / name], numbered) if not _exists(p))
+    runs = home / "runs"
+    numbered = (runs / f"{name}-{number}" for number in itertools.count(2))
+    return next(p for p in itertools.chain([runs / name], numbered) if not _exists(p))
 
 
 def resume_line(folder: Path) -> str:
@@ -353,4 +367,4 @@ def _program() -> str:
     found, called = shutil.which("merl"), Path(sys.argv[0])
     if found or called.name != "merl":
         return "merl"
-    return os.path.relpath(called)
+    return shlex.quote(str(called))

@@ -90,9 +90,10 @@ class Timing:
         steps = max(0, config.steps - done)
         repeat = config.action_repeat
         updates = (config.steps - max(done, config.seed_steps)) * config.updates_per_step
-        evaluations = max(1, steps // config.eval.every) * config.eval.episodes
+        count = config.eval.count(steps)
+        evaluations = count * config.eval.episodes
         length = 250 / repeat  # decisions of an episode, near enough for an estimate
-        videos = {"each": steps // config.eval.every or 1, "last": 1, "none": 0}[config.eval.video]
+        videos = {"each": count, "last": min(1, count), "none": 0}[config.eval.video]
         whole = max(0.0, updates) * self.update[self.best] + videos * length * self.frame
         whole += (steps / repeat + evaluations * length) * self.step
         return min(whole, (config.minutes or float("inf")) * 60)

@@ -19,7 +19,9 @@ from merl.training.stretch import Outcome, Stretch, View
 
 def start(parts: Parts, view: View) -> Outcome:
     """Begin a new run; if it fails before its first step, its folder is removed again."""
-    run = Run.create(parts.config, parts.space, parts.action_space, own_bounds(parts.env))
+    run = Run.create(
+        parts.config, parts.space, parts.action_space, own_bounds(parts.env), home=parts.home
+    )
     try:
         with run.lock():
             return _train(parts, run, None, view)

@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from merl.cli.parsing import check_writable, parse, write_json
+from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
@@ -18,6 +19,7 @@ from merl.report.references import references
 from merl.training.console import describe
 from merl.training.evaluation import EVALUATION_SEED, load_policy
 from merl.training.evaluation import evaluate as evaluate_policy
+from merl.training.run import Run
 from merl.training.timing import use_threads
 from merl.training.video import MIN_SIDE
 
@@ -36,6 +38,9 @@ class EvaluateOptions:
     """latest, best (by evaluation return), or a number of steps."""
     renderer: RendererName | None = None
     """What draws the pictures, if not what the agent was trained with."""
+    trust: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Import the environment that the run names, although you have not trained this run here: that
+    runs the code of whoever made the run."""
     json: Path | None = None
     """Also write every episode's seed, return and success into this file."""
 
@@ -60,7 +65,9 @@ def evaluate(args: list[str]) -> int:
     if options.video is not None:
         size = max(policy.config.env.render_size, MIN_SIDE)
         changes |= {"render_mode": "rgb_array", "render_size": size}
-    env = policy.make_env(**changes)
+    if options.trust:
+        tell_trusted(Run.open(options.run))
+    env = policy.make_env(trust=options.trust, **changes)
     try:
         result = evaluate_policy(
             policy, env, options.episodes, reset=policy.reset, video=options.video

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import torch
@@ -22,6 +22,7 @@ from merl.resources import available_memory, keep_freed_memory
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness
+from merl.training.resuming import left_open
 from merl.training.run import refuse_existing, run_path
 from merl.training.timing import measure, use_threads
 from merl.training.video import MIN_SIDE
@@ -32,6 +33,7 @@ class Parts:
 
     Attributes:
         config: with `device`, `threads`, the agent's `precision` and `torch_compile` decided.
+        left_open: names of the fields that this machine has decided.
         timing: what this machine needs for a step and an update.
         env: to act in.
         eval_env: to be evaluated in.
@@ -52,13 +54,14 @@ class Parts:
         self.device = choose_device(config.device)
         check_memory(config, self.space, self.action_space)
         keep_freed_memory()
+        self.left_open = left_open(config)
         self.timing = measure(config, env, eval_env, self.space, self.device)
         best = self.timing.best
         use_threads(best.threads)
         self.config = dataclasses.replace(
             config,
             threads=best.threads,
-            device="cuda" if self.device.type == "cuda" else "cpu",
+            device=device_name(config.device),
             agent=best.decided(config.agent),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
@@ -124,6 +127,11 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda":  # a run's shapes never change: trying every way to convolve once pays
         torch.backends.cudnn.benchmark = True
     return torch.device(name)
+
+
+def device_name(name: str) -> Literal["cpu", "cuda"]:
+    """The name of the device that `choose_device` chooses."""
+    return "cuda" if choose_device(name).type == "cuda" else "cpu"
 
 
 def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.Box) -> None:

@@ -21,7 +21,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,12 +32,18 @@ from gymnasium import spaces
 import merl
 from merl.agents import AGENTS
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
-from merl.envs.own import module_folder, search_first
+from merl.envs.own import imports_code, load_module, module_folder
+from merl.training import trust
 from merl.training.config import TrainConfig
 from merl.training.machine import commit, machine, package_versions
 from merl.training.plain import box, describe, from_plain, to_plain, told
+from merl.training.resuming import REOPENED
+from merl.training.trust import Origin
 
 LOCK_FILE = "lock"
+_PART = f".{CONFIG_FILE}.part"
+_FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, _PART, LOCK_FILE)
+_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 FORMAT = 1
 Bounds = tuple[list[float], list[float]]
 """Of an environment's own actions: lower, upper."""
@@ -45,63 +51,77 @@ Bounds = tuple[list[float], list[float]]
 
 @dataclass(frozen=True)
 class Run:
-    """A run's folder and the config that it was started with."""
+    """A run's folder and the config that it was started with.
+
+    Attributes:
+        path: the folder.
+        config: with everything decided that the user left open.
+        left_open: names of the fields that the user left open, so that they are decided anew on
+            another machine (`resuming.REOPENED`).
+        created: this process has created the folder.
+    """
 
     path: Path
     config: TrainConfig
+    left_open: tuple[str, ...] = REOPENED
+    created: bool = False
 
     @classmethod
-    def create(
+    @contextmanager
+    def begin(
         cls,
         config: TrainConfig,
         observation_space: spaces.Dict,
         action_space: spaces.Box,
         bounds: Bounds | None = None,
-    ) -> Run:
-        """Make the folder and record what is run.
+        left_open: tuple[str, ...] = REOPENED,
+    ) -> Iterator[Run]:
+        """Create the folder of a new run, lock it, and record what is run; unlock it at the end.
 
         Args:
             config: of the run.
             observation_space: what the agent consumes.
             action_space: what it does, in [-1, 1].
             bounds: of the environment's own actions, where they were rescaled.
+            left_open: names of the fields that the user left open.
 
         Raises:
-            MerlError: the folder exists, or cannot be made.
+            MerlError: the folder holds something, cannot be made, or another process begins a run
+                in it.
         """
-        path = run_path(config)
-        refuse_existing(path)
-        record = {
-            "format": FORMAT,
-            "merl": merl.__version__,
-            "task": config.task,
-            "agent": config.agent_name,
-            "preset": config.preset,
-            "setting": config.setting,
-            "seed": config.seed,
-            "config": to_plain(config),
-            "module_folder": _module_folder(config.task),
-            "observation_space": {key: describe(s) for key, s in observation_space.items()},
-            "action_space": describe(action_space) | {"own_bounds": bounds},
-            "versions": package_versions(),
-            "commit": commit(),
-            "machine": machine(),
-        }
-        try:
-            path.mkdir(parents=True)
-        except OSError as error:
-            raise MerlError(f"the run's folder {path} cannot be made: {error.strerror}") from None
-        run = cls(path, config)
-        try:
-            run._write(record)
-        except MerlError:
-            shutil.rmtree(path, ignore_errors=True)
-            raise
-        return run
+        path, created = _create_folder(config)
+        run = cls(path, config, left_open, created)
+        with run.lock():
+            refuse_existing(path)  # by the process that had the lock before
+            record = {
+                "format": FORMAT,
+                "id": trust.identity(),
+                "merl": merl.__version__,
+                "task": config.task,
+                "agent": config.agent_name,
+                "preset": config.preset,
+                "setting": config.setting,
+                "seed": config.seed,
+                "config": to_plain(config),
+                "left_open": list(left_open),
+                "module_folder": _module_folder(config.task),
+                "observation_space": {key: describe(s) for key, s in observation_space.items()},
+                "action_space": describe(action_space) | {"own_bounds": bounds},
+                "versions": package_versions(),
+                "commit": commit(),
+                "machine": machine(),
+            }
+            try:
+                run._write(record)
+            except MerlError:
+                run.discard()
+                raise
+            _remember(record)
+            yield run
 
     @classmethod
     def open(cls, path: Path) -> Run:
-        """A run that exists.
+        """Open a run that exists; nothing of it is imported or executed.
 
         Raises:
             MerlError: the folder is not a run's.
@@ -114,16 +134,48 @@ class Run:
             config = _read_config(record["config"])
             _recorded_spaces(record)
             _last_machine(record)
-            folder = record.get("module_folder")
-            if folder is not None:  # so that the run works from wherever it is called
-                search_first(Path(folder))
-        return cls(path, dataclasses.replace(config, run_dir=path))
+            _origin(record)
+            recorded = record.get("left_open", REOPENED)
+            left_open = tuple(name for name in REOPENED if name in recorded)
+        return cls(path, dataclasses.replace(config, run_dir=path), left_open)
+
+    def load_module(self, *, trusted: bool = False, named_in: Path | None = None) -> None:
+        """Import the module of the run's environment, if the environment is the user's own.
+
+        Args:
+            trusted: the user says that the module may be imported, as `origin` names it.
+            named_in: the folder in which the user named the task, where the module may lie, too.
+
+        Raises:
+            MerlError: nobody says that it may be imported (`trust.check`), or it cannot be.
+        """
+        if not imports_code(self.config.task):
+            return
+        record = _read(self.path)
+        origin = _origin(record)
+        folders = []
+        try:
+            folders = [trust.check(self.path, record.get("id"), origin).folder]
+        except MerlError:
+            if trusted:
+                folders = [origin.folder]
+            elif named_in is None:
+                raise
+        if ":" in self.config.task:
+            places = [Path(folder) for folder in folders if folder is not None]
+            load_module(self.config.task, *places, *([] if named_in is None else [named_in]))
+
+    def origin(self) -> Origin | None:
+        """The code that the run names as its environment; None if it is merl's or Gymnasium's."""
+        return _origin(_read(self.path)) if imports_code(self.config.task) else None
 
     def record_resumption(self, step: int) -> None:
         """Note that the run goes on from `step`, with what; from now on its config is this one."""
         record = _read(self.path)
         record["config"] = to_plain(self.config)
+        record["left_open"] = list(self.left_open)
         record["module_folder"] = _module_folder(self.config.task)
+        record["id"] = trust.identity(record.get("id"))
         record.setdefault("resumed", []).append(
             {
                 "step": step,
@@ -134,6 +186,7 @@ class Run:
             }
         )
         self._write(record)
+        _remember(record)
 
     def check_environment(
         self, observation_space: spaces.Dict, action_space: spaces.Box, bounds: Bounds | None
@@ -198,6 +251,35 @@ class Run:
                 "it: the run stops, and writes nothing in its place"
             )
 
+    def check_links(self) -> None:
+        """Refuse to write through links that lead out of the folder, where a stranger put them.
+
+        Raises:
+            MerlError: naming the link.
+        """
+        root = self.path.resolve()
+        for folder, folders, files in os.walk(self.path):
+            for name in (*folders, *files):
+                path = Path(folder, name)
+                if path.is_symlink() and root not in path.resolve().parents:
+                    raise MerlError(
+                        f"{path} is a link to {path.readlink()}, outside of the run, and is not "
+                        "written to: replace it by what it leads to"
+                    )
+
+    def discard(self) -> None:
+        """Remove what this process has written into a new run's folder, and the folder it made."""
+        for name in (*_FOLDERS, *_FILES):
+            path = self.path / name
+            if name in _FOLDERS:
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
+        if self.created:
+            with suppress(OSError):  # somebody has put a file into it
+                self.path.rmdir()
+
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Keep every other process from training in this folder; the lock dies with the process.
@@ -210,12 +292,18 @@ class Run:
             try:
                 file = stack.enter_context(path.open("a+"))
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                same = os.path.sameopenfile(
+                    file.fileno(), stack.enter_context(path.open()).fileno()
+                )
             except BlockingIOError:
-                raise MerlError(
-                    f"process {path.read_text().strip()} is training in {self.path}: stop it first"
-                ) from None
+                owner = f"process {_text(path)}" if _text(path) else "another process"
+                raise MerlError(f"{owner} is training in {self.path}: stop it first") from None
+            except FileNotFoundError:
+                same = False
             except OSError as error:
                 raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
+            if not same:
+                raise MerlError(f"run folder {self.path} was removed by another process just now")
             file.truncate(0)
             file.write(str(os.getpid()))
             file.flush()
@@ -223,7 +311,7 @@ class Run:
 
     def _write(self, record: Mapping[str, Any]) -> None:
         """Replace `config.json` whole."""
-        part = self.path / f".{CONFIG_FILE}.part"
+        part = self.path / _PART
         try:
             with part.open("w") as file:
                 file.write(json.dumps(record, indent=1))
@@ -273,21 +361,58 @@ def resume_line(folder: Path) -> str:
 def refuse_existing(path: Path) -> None:
     """Never write into a folder that holds something.
 
+    A folder that is empty, or that a run left which was killed at its very start, holds nothing.
+
     Raises:
-        MerlError: the folder exists, or its name is refused by the system.
+        MerlError: the folder holds something, or its name is refused by the system.
     """
-    if _exists(path):
-        raise MerlError(
-            f"run folder {path} exists already: go on with `{resume_line(path)}`, or name another "
-            "with --run-dir"
+    if not _exists(path) or _holds_nothing(path):
+        return
+    if _exists(path / CONFIG_FILE):
+        way = f"go on with `{resume_line(path)}`, or name another"
+    else:
+        way = "it is not a run: name another"
+    raise MerlError(f"run folder {path} exists already: {way} with --run-dir")
+
+
+def _holds_nothing(path: Path) -> bool:
+    """Whether nothing is there but what a run writes before its config."""
+    try:
+        return path.is_dir() and all(
+            entry.name in (LOCK_FILE, _PART) and not entry.is_symlink() for entry in path.iterdir()
         )
+    except OSError:  # it may not be read
+        return False
+
+
+def _create_folder(config: TrainConfig) -> tuple[Path, bool]:
+    """The folder of a new run, and whether this process has created it.
+
+    Raises:
+        MerlError: it holds something, or cannot be made.
+    """
+    while True:
+        path = run_path(config)
+        refuse_existing(path)
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            if config.run_dir is None:
+                continue  # another process has just taken this name
+            return path, False
+        except OSError as error:
+            raise MerlError(f"the run's folder {path} cannot be made: {error.strerror}") from None
+        return path, True
 
 
 def _exists(path: Path) -> bool:
     try:
-        return path.exists()
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
     except OSError as error:  # too long a name, a folder that may not be searched
         raise MerlError(f"run folder {path} cannot be used: {error.strerror}") from None
+    return True
 
 
 def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
@@ -309,7 +434,13 @@ def _readable(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}") from None
+        way = ""
+        if _holds_nothing(path):
+            way = (
+                ", and nothing else: begin it with the line of before, "
+                f"{_program()} train ... --run-dir {shlex.quote(str(path))}"
+            )
+        raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}{way}") from None
     except UnicodeDecodeError:
         raise MerlError(f"{file} cannot be read: it is no text") from None
     except KeyError as error:
@@ -336,6 +467,27 @@ def _recorded_spaces(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box
 def _module_folder(task: str) -> str | None:
     folder = module_folder(task)
     return None if folder is None else str(folder)
+
+
+def _origin(record: Mapping[str, Any]) -> Origin:
+    """What `config.json` says of the environment; not to be believed."""
+    task, folder = record["config"]["task"], record.get("module_folder")
+    if not isinstance(task, str) or not isinstance(folder, str | None):
+        raise TypeError(f"task is {task!r} and module_folder {folder!r}")
+    return Origin(task, folder)
+
+
+def _remember(record: Mapping[str, Any]) -> None:
+    """Record outside of the run's folder that this user trains it."""
+    origin = _origin(record)
+    if imports_code(origin.task):
+        trust.remember(record["id"], origin)
+
+
+def _text(path: Path) -> str:
+    with suppress(OSError, UnicodeDecodeError):
+        return path.read_text().strip()
+    return ""
 
 
 def _program() -> str:

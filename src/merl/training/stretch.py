@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from merl.core import EnvironmentFailed, EnvironmentsLost, is_image
+from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, is_image
 from merl.replay import Lanes
 from merl.training import checkpoint
 from merl.training.acting import Environments, Lost
@@ -60,6 +60,7 @@ class Outcome:
         evaluation: the last one, if there was any.
         signal: what interrupted it; None if it ran to its end.
         saved: whether its last checkpoint is on the disk.
+        unwritten: rows of metrics that could not be written.
     """
 
     run: Run
@@ -67,6 +68,7 @@ class Outcome:
     evaluation: Evaluation | None
     signal: int | None
     saved: bool
+    unwritten: int = 0
 
 
 class _Interrupted(Exception):  # noqa: N818 (no error, a way out)
@@ -133,8 +135,11 @@ class Stretch:
         self.view.begin(self.run, progress.step)
         if not parts.films and self.config.eval.video != "none":
             self.view.warn("there will be no videos: the environment does not render to an array")
-        if progress.step == 0:
-            self._save()  # from here on there is something to go on from
+        if progress.step == 0 and not self._save():  # there must be something to go on from
+            raise MerlError(
+                f"no checkpoint can be written into {self.run.path}: make room on its disk, or "
+                "name a folder on another with --run-dir"
+            )
         self.clock.mark(progress)
         self._ended = progress.step
         moments = train(

@@ -145,7 +145,7 @@ def check_saved(outcome: Outcome) -> None:
     """Report what of a run's end is not on the disk.
 
     Raises:
-        NotSaved: its last checkpoint, or rows of its metrics.
+        NotSaved: naming what is missing, its last checkpoint, or rows of its metrics.
     """
     run, rows = outcome.run, outcome.unwritten
     lost = [] if outcome.saved else ["its checkpoint"]

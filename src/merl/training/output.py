@@ -46,6 +46,13 @@ class TolerantStream:
         with self._noting():
             self._stream.flush()
 
+    def isatty(self) -> bool:
+        """Whether it is a terminal; a stream that is closed is none."""
+        try:
+            return self._stream.isatty()
+        except (OSError, ValueError):
+            return False
+
     def finish(self) -> None:
         """Flush, and discard what cannot be flushed, or Python would complain when it exits."""
         self.flush()

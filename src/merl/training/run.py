@@ -304,9 +304,9 @@ class Run:
                 raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
             if not same:
                 raise MerlError(f"run folder {self.path} was removed by another process just now")
-            file.truncate(0)
-            file.write(str(os.getpid()))
-            file.flush()
+            with suppress(OSError):  # a full disk; the lock holds without the number
+                file.truncate(0)
+                os.write(file.fileno(), str(os.getpid()).encode())
             yield
 
     def _write(self, record: Mapping[str, Any]) -> None:

@@ -223,7 +223,7 @@ def test_what_the_users_code_raises_is_told_and_the_run_saved(
     assert main(["train", task, *SHORT, "--eval.video", "none", "--run-dir", "run"]) == 4
     error = capsys.readouterr().err.strip()
     assert "step raised OSError: servo 3 does not answer (arm_that_fails_step.py, line 2" in error
-    assert "go on with `merl resume run`" in error
+    assert f"go on with `merl resume {tmp_path}/run`" in error
     assert len(error.splitlines()) == 1
     saved = max(int(path.name) for path in Path("run/checkpoints").iterdir())
     assert saved > 0

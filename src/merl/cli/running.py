@@ -14,7 +14,6 @@ from rich.filesize import decimal
 
 from merl.cli.summary import summarize
 from merl.core import MerlError, NotSaved, is_image
-from merl.envs.own import load_module
 from merl.replay import replay_bytes
 from merl.training import trainer
 from merl.training.checkpoint import Checkpoint
@@ -23,7 +22,7 @@ from merl.training.console import ConsoleView
 from merl.training.environment import own_bounds
 from merl.training.parts import Parts, device_name
 from merl.training.resuming import REOPENED, left_open, reopened, taken_up
-from merl.training.run import Run, refuse_existing, resume_line, run_path
+from merl.training.run import Run, resume_line
 from merl.training.stretch import Outcome
 
 
@@ -34,9 +33,6 @@ def begin(config: TrainConfig, what: str) -> int:
         config: of the run.
         what: it is, for the first line.
     """
-    refuse_existing(run_path(config))
-    if config.own_env and ":" in config.task:
-        load_module(config.task, Path.cwd())
     return _train(config, what)
 
 

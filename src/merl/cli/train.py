@@ -53,7 +53,7 @@ def train(args: list[str]) -> int:
             raise MerlError("--resume needs --run-dir: which run is to go on?")
         if (config.run_dir / CONFIG_FILE).exists():
             closed = decided(compose(preset, task, agent, setting))
-            given_open = left_open(_parse(args, closed).config)
+            given_open = {*left_open(_parse(args, closed).config)} - {*left_open(closed)}
             return go_on(Run.open(config.run_dir), config, given_open, named_in=Path.cwd())
     return begin(config, f"preset {preset} ({why}; {PRESETS[preset].about})")
 

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
@@ -17,6 +18,7 @@ from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
 from merl.core import MerlError
+from merl.envs.own import load_module
 from merl.replay import check_fits
 from merl.resources import available_memory, keep_freed_memory
 from merl.training.config import TrainConfig
@@ -37,6 +39,7 @@ class Parts:
         timing: what this machine needs for a step and an update.
         env: to act in.
         eval_env: to be evaluated in.
+        home: the working folder at the start, which a relative run folder lies in.
         films: whether that can be filmed.
         space: what the agent consumes.
         action_space: what it does.
@@ -46,9 +49,13 @@ class Parts:
     """
 
     def __init__(
-        self, config: TrainConfig, env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, Any]
+        self,
+        config: TrainConfig,
+        env: gymnasium.Env[Any, Any],
+        eval_env: gymnasium.Env[Any, Any],
+        home: Path,
     ) -> None:
-        self.env, self.eval_env = env, eval_env
+        self.env, self.eval_env, self.home = env, eval_env, home
         self.films = eval_env.render_mode == "rgb_array"
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
@@ -81,7 +88,8 @@ class Parts:
 
         Args:
             config: of the run.
-            new: the run begins, so its folder must not exist and its replay must fit.
+            new: the run begins, so its folder must not exist and its replay must fit; the module of
+                a user's environment is looked for in the working folder.
 
         Raises:
             MerlError: a device, renderer, sense, folder or size that is not to be had.
@@ -93,8 +101,11 @@ class Parts:
                 f"threads is {config.threads}, but this machine has {processors} processors: "
                 f"give at most {processors}"
             )
+        home = Path.cwd()  # before any user code runs, which may change it
         if new:
-            refuse_existing(run_path(config))
+            refuse_existing(run_path(config, home))
+            if config.own_env and ":" in config.task:
+                load_module(config.task, home)
         with ExitStack() as stack:
             env = make_run_env(config)
             stack.callback(env.close)
@@ -104,14 +115,14 @@ class Parts:
                     config.replay,
                     space,
                     actions,
-                    directory=run_path(config),
+                    directory=run_path(config, home),
                     capacity=config.capacity,
                     lanes=config.num_envs,
                 )
             size = max(config.env.render_size, MIN_SIDE)
             eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)
             stack.callback(eval_env.close)
-            yield cls(config, env, eval_env)
+            yield cls(config, env, eval_env, home)
 
 
 def choose_device(name: str) -> torch.device:

@@ -75,6 +75,8 @@ class Run:
         action_space: spaces.Box,
         bounds: Bounds | None = None,
         left_open: tuple[str, ...] = REOPENED,
+        *,
+        home: Path | None = None,
     ) -> Iterator[Run]:
         """Create the folder of a new run, lock it, and record what is run; unlock it at the end.
 
@@ -84,12 +86,13 @@ class Run:
             action_space: what it does, in [-1, 1].
             bounds: of the environment's own actions, where they were rescaled.
             left_open: names of the fields that the user left open.
+            home: see `run_path`.
 
         Raises:
             MerlError: the folder holds something, cannot be made, or another process begins a run
                 in it.
         """
-        path, created = _create_folder(config)
+        path, created = _create_folder(config, home)
         run = cls(path, config, left_open, created)
         with run.lock():
             refuse_existing(path)  # by the process that had the lock before
@@ -126,6 +129,7 @@ class Run:
         Raises:
             MerlError: the folder is not a run's.
         """
+        path = path.absolute()  # user code may change the working folder
         with _readable(path):
             record = _read(path)
             number = record["format"]
@@ -342,15 +346,25 @@ class Run:
             return _recorded_spaces(_read(self.path))
 
 
-def run_path(config: TrainConfig) -> Path:
-    """The folder that a config names, or the first of the default ones that is free."""
+def run_path(config: TrainConfig, home: Path | None = None) -> Path:
+    """Return the folder that a config names, or the first of the default ones that is free.
+
+    Args:
+        config: of the run.
+        home: where a relative folder lies; the working folder if None.
+
+    Returns:
+        An absolute path.
+    """
+    home = Path.cwd() if home is None else home
     if config.run_dir is not None:
-        return config.run_dir
+        return home / config.run_dir
     agent = config.agent_name if config.setting == "matched" else f"{config.agent_name}-published"
     task = re.sub(r"[^\w.-]+", "-", config.task)  # `module:function`, `namespace/Id-v0`
     name = f"{task}-{agent}-{config.preset}-s{config.seed}"
-    numbered = (Path("runs") / f"{name}-{number}" for number in itertools.count(2))
-    return next(p for p in itertools.chain([Path("runs") / name], numbered) if not _exists(p))
+    runs = home / "runs"
+    numbered = (runs / f"{name}-{number}" for number in itertools.count(2))
+    return next(p for p in itertools.chain([runs / name], numbered) if not _exists(p))
 
 
 def resume_line(folder: Path) -> str:
@@ -385,14 +399,14 @@ def _holds_nothing(path: Path) -> bool:
         return False
 
 
-def _create_folder(config: TrainConfig) -> tuple[Path, bool]:
+def _create_folder(config: TrainConfig, home: Path | None) -> tuple[Path, bool]:
     """The folder of a new run, and whether this process has created it.
 
     Raises:
         MerlError: it holds something, or cannot be made.
     """
     while True:
-        path = run_path(config)
+        path = run_path(config, home)
         refuse_existing(path)
         try:
             path.mkdir(parents=True)
@@ -495,4 +509,4 @@ def _program() -> str:
     found, called = shutil.which("merl"), Path(sys.argv[0])
     if found or called.name != "merl":
         return "merl"
-    return os.path.relpath(called)
+    return shlex.quote(str(called))

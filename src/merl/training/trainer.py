@@ -19,8 +19,8 @@ from merl.training.stretch import Outcome, Stretch, View
 def start(parts: Parts, view: View) -> Outcome:
     """Begin a new run; if it fails before its first step, nothing is left of it."""
     bounds = own_bounds(parts.env)
-    space, actions = parts.space, parts.action_space
-    with Run.begin(parts.config, space, actions, bounds, parts.left_open) as run:
+    space, actions, names = parts.space, parts.action_space, parts.left_open
+    with Run.begin(parts.config, space, actions, bounds, names, home=parts.home) as run:
         try:
             return _train(parts, run, None, view)
         except BaseException:

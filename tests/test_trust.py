@@ -229,19 +229,20 @@ def test_where_no_record_can_be_kept_nothing_is_trusted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     identity, origin = trust.identity(), Origin("evil:make", None)
+    record = {"id": identity, "config": {"task": "evil:make"}, "module_folder": None}
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    trust.remember(identity, origin)
+    trust.remember(record)
     assert "--trust will be needed" in caplog.text
     with pytest.raises(MerlError, match="records of runs cannot be read"):
-        trust.check(tmp_path, identity, origin)
+        trust.check(tmp_path, record)
     monkeypatch.setenv("XDG_STATE_HOME", "relative")  # would lie in the working folder
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    trust.remember(identity, origin)
+    trust.remember(record)
     assert (tmp_path / ".local" / "state" / "merl" / "runs" / identity).is_file()
     assert not (tmp_path / "relative").exists()
-    assert trust.check(tmp_path, identity, origin) == origin
+    assert trust.check(tmp_path, record) == origin
 
 
 @pytest.mark.parametrize("name", ["lock", ".config.json.part", "checkpoints/00000020", "replay"])

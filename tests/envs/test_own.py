@@ -140,7 +140,7 @@ def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> 
         "Pendulm-v1": "did you mean 'Pendulum-v1'",
         "reach_dulpo": "did you mean 'reach_duplo'",
         "zzz": "choose from reach_duplo, move_box, lift_box, or name a Gymnasium id",
-        "no_such_module:make": "call merl where it lies",
+        "no_such_module:make": "name its folder in PYTHONPATH",
         "my_robot_here:maker": "has no function 'maker'",
         "my_robot_here:limit": "a function is needed",
         "my_robot_here:number": "gave int",

@@ -16,7 +16,8 @@ from merl.cli import main
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import compose
 from merl.training.config import TrainConfig
-from merl.training.run import LOCK_FILE, Run
+from merl.training.run import Run
+from merl.training.run_folder import LOCK_FILE
 from toy import DotEnv
 
 CONFIG = compose("smoke", "reach_duplo")

@@ -22,7 +22,8 @@ from merl.training.console import ConsoleView
 from merl.training.environment import own_bounds
 from merl.training.parts import Parts, device_name
 from merl.training.resuming import REOPENED, left_open, reopened, taken_up
-from merl.training.run import Run, resume_line
+from merl.training.run import Run
+from merl.training.run_folder import check_links, resume_line
 from merl.training.stretch import Outcome
 
 
@@ -71,9 +72,9 @@ def go_on(
     )
     if run.has_moved() or config.device != run.config.device:
         config = reopened(config, run.left_open)
-    run.check_links()
-    run.load_module(trusted=trusted, named_in=named_in)
+    check_links(run.path)
     with run.lock():
+        run.load_module(trusted=trusted, named_in=named_in)
         if run.begin_again():
             return _train(config, f"run {run.path} was ended before its first step", (run, None))
         start = Checkpoint.find(run.checkpoints)

@@ -97,10 +97,10 @@ def load_module(task: str, *folders: Path) -> ModuleType:
             raise MerlError(
                 f"task {task!r}: {module!r} imports {error.name!r}, which is not installed here"
             ) from None
-        looked = "".join(f" in {folder} or" for folder in folders)
+        places = " or ".join([*map(str, folders), "what is installed"])
         raise MerlError(
-            f"task {task!r}: {error}{looked} among what is installed: call merl where it lies, or "
-            "name its folder in PYTHONPATH"
+            f"task {task!r}: {error} in {places}: name its folder in PYTHONPATH, or call `merl "
+            "train` where it lies"
         ) from None
     except Exception as error:
         raise MerlError(

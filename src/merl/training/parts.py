@@ -25,7 +25,7 @@ from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness
 from merl.training.resuming import left_open
-from merl.training.run import refuse_existing, run_path
+from merl.training.run_folder import refuse_existing, run_path
 from merl.training.timing import measure, use_threads
 from merl.training.video import MIN_SIDE
 

@@ -12,16 +12,12 @@ curve.png       the learning curve, drawn when training ends
 from __future__ import annotations
 
 import dataclasses
-import fcntl
-import itertools
 import json
 import os
-import re
 import shlex
 import shutil
-import sys
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,12 +34,17 @@ from merl.training.config import TrainConfig
 from merl.training.machine import commit, machine, package_versions
 from merl.training.plain import box, describe, from_plain, to_plain, told
 from merl.training.resuming import REOPENED
+from merl.training.run_folder import (
+    PART,
+    create_folder,
+    discard_folder,
+    holds_nothing,
+    lock_folder,
+    program,
+    refuse_existing,
+)
 from merl.training.trust import Origin
 
-LOCK_FILE = "lock"
-_PART = f".{CONFIG_FILE}.part"
-_FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, _PART, LOCK_FILE)
-_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 FORMAT = 1
 Bounds = tuple[list[float], list[float]]
 """Of an environment's own actions: lower, upper."""
@@ -92,7 +93,7 @@ class Run:
             MerlError: the folder holds something, cannot be made, or another process begins a run
                 in it.
         """
-        path, created = _create_folder(config, home)
+        path, created = create_folder(config, home)
         run = cls(path, config, left_open, created)
         with run.lock():
             refuse_existing(path)  # by the process that had the lock before
@@ -116,10 +117,10 @@ class Run:
             }
             try:
                 run._write(record)
+                trust.remember(record)
             except MerlError:
                 run.discard()
                 raise
-            _remember(record)
             yield run
 
     @classmethod
@@ -138,7 +139,7 @@ class Run:
             config = _read_config(record["config"])
             _recorded_spaces(record)
             _last_machine(record)
-            _origin(record)
+            trust.origin(record)
             recorded = record.get("left_open", REOPENED)
             left_open = tuple(name for name in REOPENED if name in recorded)
         return cls(path, dataclasses.replace(config, run_dir=path), left_open)
@@ -156,22 +157,21 @@ class Run:
         if not imports_code(self.config.task):
             return
         record = _read(self.path)
-        origin = _origin(record)
-        folders = []
+        folder: str | None = None
         try:
-            folders = [trust.check(self.path, record.get("id"), origin).folder]
+            folder = trust.check(self.path, record).folder
         except MerlError:
             if trusted:
-                folders = [origin.folder]
+                folder = trust.origin(record).folder
             elif named_in is None:
                 raise
         if ":" in self.config.task:
-            places = [Path(folder) for folder in folders if folder is not None]
-            load_module(self.config.task, *places, *([] if named_in is None else [named_in]))
+            folders = [Path(folder) if folder is not None else None, named_in]
+            load_module(self.config.task, *(each for each in folders if each is not None))
 
     def origin(self) -> Origin | None:
         """The code that the run names as its environment; None if it is merl's or Gymnasium's."""
-        return _origin(_read(self.path)) if imports_code(self.config.task) else None
+        return trust.origin(_read(self.path)) if imports_code(self.config.task) else None
 
     def record_resumption(self, step: int) -> None:
         """Note that the run goes on from `step`, with what; from now on its config is this one."""
@@ -190,7 +190,7 @@ class Run:
             }
         )
         self._write(record)
-        _remember(record)
+        trust.remember(record)
 
     def check_environment(
         self, observation_space: spaces.Dict, action_space: spaces.Box, bounds: Bounds | None
@@ -255,67 +255,17 @@ class Run:
                 "it: the run stops, and writes nothing in its place"
             )
 
-    def check_links(self) -> None:
-        """Refuse to write through links that lead out of the folder, where a stranger put them.
-
-        Raises:
-            MerlError: naming the link.
-        """
-        root = self.path.resolve()
-        for folder, folders, files in os.walk(self.path):
-            for name in (*folders, *files):
-                path = Path(folder, name)
-                if path.is_symlink() and root not in path.resolve().parents:
-                    raise MerlError(
-                        f"{path} is a link to {path.readlink()}, outside of the run, and is not "
-                        "written to: replace it by what it leads to"
-                    )
-
     def discard(self) -> None:
-        """Remove what this process has written into a new run's folder, and the folder it made."""
-        for name in (*_FOLDERS, *_FILES):
-            path = self.path / name
-            if name in _FOLDERS:
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                with suppress(OSError):
-                    path.unlink(missing_ok=True)
-        if self.created:
-            with suppress(OSError):  # somebody has put a file into it
-                self.path.rmdir()
+        """Remove what this process has written, before the first step of a new run."""
+        discard_folder(self.path, self.created)
 
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Keep every other process from training in this folder; the lock dies with the process.
-
-        Raises:
-            MerlError: another process trains here.
-        """
-        path = self.path / LOCK_FILE
-        with ExitStack() as stack:
-            try:
-                file = stack.enter_context(path.open("a+"))
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                same = os.path.sameopenfile(
-                    file.fileno(), stack.enter_context(path.open()).fileno()
-                )
-            except BlockingIOError:
-                owner = f"process {_text(path)}" if _text(path) else "another process"
-                raise MerlError(f"{owner} is training in {self.path}: stop it first") from None
-            except FileNotFoundError:
-                same = False
-            except OSError as error:
-                raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
-            if not same:
-                raise MerlError(f"run folder {self.path} was removed by another process just now")
-            with suppress(OSError):  # a full disk; the lock holds without the number
-                file.truncate(0)
-                os.write(file.fileno(), str(os.getpid()).encode())
-            yield
+    def lock(self) -> AbstractContextManager[None]:
+        """Keep every other process from training in this folder; see `lock_folder`."""
+        return lock_folder(self.path)
 
     def _write(self, record: Mapping[str, Any]) -> None:
         """Replace `config.json` whole."""
-        part = self.path / _PART
+        part = self.path / PART
         try:
             with part.open("w") as file:
                 file.write(json.dumps(record, indent=1))
@@ -346,89 +296,6 @@ class Run:
             return _recorded_spaces(_read(self.path))
 
 
-def run_path(config: TrainConfig, home: Path | None = None) -> Path:
-    """Return the folder that a config names, or the first of the default ones that is free.
-
-    Args:
-        config: of the run.
-        home: where a relative folder lies; the working folder if None.
-
-    Returns:
-        An absolute path.
-    """
-    home = Path.cwd() if home is None else home
-    if config.run_dir is not None:
-        return home / config.run_dir
-    agent = config.agent_name if config.setting == "matched" else f"{config.agent_name}-published"
-    task = re.sub(r"[^\w.-]+", "-", config.task)  # `module:function`, `namespace/Id-v0`
-    name = f"{task}-{agent}-{config.preset}-s{config.seed}"
-    runs = home / "runs"
-    numbered = (runs / f"{name}-{number}" for number in itertools.count(2))
-    return next(p for p in itertools.chain([runs / name], numbered) if not _exists(p))
-
-
-def resume_line(folder: Path) -> str:
-    """What to type to go on with a run."""
-    return f"{_program()} resume {shlex.quote(str(folder))}"
-
-
-def refuse_existing(path: Path) -> None:
-    """Never write into a folder that holds something.
-
-    A folder that is empty, or that a run left which was killed at its very start, holds nothing.
-
-    Raises:
-        MerlError: the folder holds something, or its name is refused by the system.
-    """
-    if not _exists(path) or _holds_nothing(path):
-        return
-    if _exists(path / CONFIG_FILE):
-        way = f"go on with `{resume_line(path)}`, or name another"
-    else:
-        way = "it is not a run: name another"
-    raise MerlError(f"run folder {path} exists already: {way} with --run-dir")
-
-
-def _holds_nothing(path: Path) -> bool:
-    """Whether nothing is there but what a run writes before its config."""
-    try:
-        return path.is_dir() and all(
-            entry.name in (LOCK_FILE, _PART) and not entry.is_symlink() for entry in path.iterdir()
-        )
-    except OSError:  # it may not be read
-        return False
-
-
-def _create_folder(config: TrainConfig, home: Path | None) -> tuple[Path, bool]:
-    """The folder of a new run, and whether this process has created it.
-
-    Raises:
-        MerlError: it holds something, or cannot be made.
-    """
-    while True:
-        path = run_path(config, home)
-        refuse_existing(path)
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            if config.run_dir is None:
-                continue  # another process has just taken this name
-            return path, False
-        except OSError as error:
-            raise MerlError(f"the run's folder {path} cannot be made: {error.strerror}") from None
-        return path, True
-
-
-def _exists(path: Path) -> bool:
-    try:
-        path.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except OSError as error:  # too long a name, a folder that may not be searched
-        raise MerlError(f"run folder {path} cannot be used: {error.strerror}") from None
-    return True
-
-
 def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
     """A run's config; that of its agent is of the kind that the agent's name says."""
     name = plain.get("agent_name", "merl")
@@ -449,10 +316,10 @@ def _readable(path: Path) -> Iterator[None]:
         yield
     except FileNotFoundError:
         way = ""
-        if _holds_nothing(path):
+        if holds_nothing(path):
             way = (
                 ", and nothing else: begin it with the line of before, "
-                f"{_program()} train ... --run-dir {shlex.quote(str(path))}"
+                f"{program()} train ... --run-dir {shlex.quote(str(path))}"
             )
         raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}{way}") from None
     except UnicodeDecodeError:
@@ -481,32 +348,3 @@ def _recorded_spaces(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box
 def _module_folder(task: str) -> str | None:
     folder = module_folder(task)
     return None if folder is None else str(folder)
-
-
-def _origin(record: Mapping[str, Any]) -> Origin:
-    """What `config.json` says of the environment; not to be believed."""
-    task, folder = record["config"]["task"], record.get("module_folder")
-    if not isinstance(task, str) or not isinstance(folder, str | None):
-        raise TypeError(f"task is {task!r} and module_folder {folder!r}")
-    return Origin(task, folder)
-
-
-def _remember(record: Mapping[str, Any]) -> None:
-    """Record outside of the run's folder that this user trains it."""
-    origin = _origin(record)
-    if imports_code(origin.task):
-        trust.remember(record["id"], origin)
-
-
-def _text(path: Path) -> str:
-    with suppress(OSError, UnicodeDecodeError):
-        return path.read_text().strip()
-    return ""
-
-
-def _program() -> str:
-    """What to type to call this program again: `merl` if the shell would find it."""
-    found, called = shutil.which("merl"), Path(sys.argv[0])
-    if found or called.name != "merl":
-        return "merl"
-    return shlex.quote(str(called))

@@ -20,7 +20,8 @@ from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
 from merl.training.plain import to_plain
 from merl.training.rollout import FrameStack, mean_metrics
-from merl.training.run import Run, resume_line
+from merl.training.run import Run
+from merl.training.run_folder import resume_line
 from merl.training.signals import Interrupt
 from merl.training.updating import make_update
 

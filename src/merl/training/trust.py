@@ -13,12 +13,14 @@ import logging
 import os
 import re
 import uuid
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from merl.core import MerlError
+from merl.envs.own import imports_code
 
 _LOG = logging.getLogger(__name__)
 
@@ -49,17 +51,35 @@ def identity(known: Any = None) -> str:
     return known if _is_identity(known) else uuid.uuid4().hex
 
 
-def remember(identity: str, origin: Origin) -> None:
-    """Record that this user trains a run, so that it can be resumed and evaluated without --trust.
+def origin(record: Mapping[str, Any]) -> Origin:
+    """What a `config.json` says of the environment of its run.
+
+    Raises:
+        TypeError: it is not of the form that merl writes.
+    """
+    task, folder = record["config"]["task"], record.get("module_folder")
+    if not isinstance(task, str) or not isinstance(folder, str | None):
+        raise TypeError(f"task is {task!r} and module_folder {folder!r}")
+    return Origin(task, folder)
+
+
+def remember(record: Mapping[str, Any]) -> None:
+    """Record that this user trains a run, if its environment is code that `check` asks about.
 
     A record that cannot be written is a warning.
+
+    Args:
+        record: what `config.json` holds.
     """
+    told, name = origin(record), record["id"]
+    if not imports_code(told.task):
+        return
     try:
         folder = _folder()
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        part = folder / f".{identity}.{os.getpid()}.part"
-        part.write_text(json.dumps(asdict(origin)))
-        part.replace(folder / identity)
+        part = folder / f".{name}.{os.getpid()}.part"
+        part.write_text(json.dumps(asdict(told)))
+        part.replace(folder / name)
     except OSError as error:
         _LOG.warning(
             "that you trained this run is not recorded (%s): to resume or evaluate it, "
@@ -68,29 +88,29 @@ def remember(identity: str, origin: Origin) -> None:
         )
 
 
-def check(run: Path, identity: Any, origin: Origin) -> Origin:
+def check(run: Path, record: Mapping[str, Any]) -> Origin:
     """The recorded origin of a run that this user has trained.
 
     Args:
         run: the run's folder, for the message.
-        identity: the run's id, as its `config.json` says.
-        origin: likewise.
+        record: what its `config.json` holds.
 
     Raises:
         MerlError: there is no such record, or it is of another environment.
     """
+    told = origin(record)
     try:
-        recorded = _recorded(identity)
+        recorded = _recorded(record.get("id"))
     except OSError as error:
         reason = f"your records of runs cannot be read ({error})"
     else:
-        if recorded is not None and recorded.task == origin.task:
+        if recorded is not None and recorded.task == told.task:
             return recorded
         reason = "you have no record of training it here"
         if recorded is not None:
             reason = f"it was trained here with {recorded}, and its config.json was changed since"
     raise MerlError(
-        f"{run} names code as its environment: {origin}. It is not imported, for {reason}: read "
+        f"{run} names code as its environment: {told}. It is not imported, for {reason}: read "
         "that code, then add --trust (in Python: make_env(trust=True))"
     )
 

@@ -16,6 +16,14 @@ ALLOWED_SKIPS = (
 """Reasons, as regular expressions, for which a test may be skipped; any other skip is a failure."""
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _records_of_their_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The records of trained runs, which a user has in the home folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
     """Tests share two cores and small tensors: threads would only get in each other's way."""

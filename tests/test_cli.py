@@ -106,6 +106,21 @@ def test_evaluate_and_a_policy_driven_by_hand_agree_exactly(run: Path, tmp_path:
     env.close()
 
 
+def test_a_hostile_folder_is_evaluated_without_importing_from_it(run: Path, tmp_path: Path) -> None:
+    """One of merl's own tasks, called in the run's folder, which names itself for modules."""
+    folder = tmp_path / "stranger"
+    shutil.copytree(run, folder)
+    record = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(record | {"module_folder": str(folder)}))
+    for name in ("dm_control", "mujoco", "warp", "torch", "av", "rich", "sitecustomize"):
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").write_text("open('imported', 'w')")
+    command = [*MERL, "evaluate", ".", "--episodes", "1"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert not (folder / "imported").exists()
+
+
 def test_a_policy_says_what_it_misses(run: Path) -> None:
     policy = merl.load_policy(run)
     with pytest.raises(merl.core.MerlError, match="lacks 'proprio'"):

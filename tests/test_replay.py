@@ -595,10 +595,24 @@ def test_a_state_that_is_not_held_is_refused(tmp_path):
     state = run.replay.state_dict()
     with pytest.raises(MerlError, match="does not hold moment 6"):
         make().load_state_dict(state)
-    run.play(20, 20)
-    with pytest.raises(MerlError, match="does not hold moment 6"):
-        run.replay.load_state_dict(state)
     check(run.replay, run.account)  # and nothing has changed
+
+
+def test_a_state_that_was_overwritten_and_not_kept_leaves_the_newer_steps(
+    tmp_path, monkeypatch, caplog
+):
+    """As on a disk that was full from the last checkpoint to the end."""
+    run = Run(tmp_path / "replay")
+    run.play(5)
+    state = run.replay.state_dict()
+    run.replay.settle()
+    monkeypatch.setattr("merl.replay.journal.Journal.keep", lambda *_, **__: None)
+    run.play(20, 20)
+    for ring in (run.replay, make(run.directory)):
+        ring.load_state_dict(state)
+        assert "has overwritten what it held at the checkpoint" in caplog.text
+        check(ring, run.account)
+        caplog.clear()
 
 
 def test_it_grows_when_opened_with_a_larger_capacity(tmp_path):

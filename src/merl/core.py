@@ -52,6 +52,12 @@ class NotFinite(MerlError):  # noqa: N818 (a state of affairs, as in `isfinite`)
     exit_code = 3
 
 
+class NotSaved(MerlError):  # noqa: N818 (what happened, not a mistake)
+    """The run has ended, and its end could not be written to the disk."""
+
+    exit_code = 5
+
+
 class EnvironmentsLost(MerlError):  # noqa: N818 (what happened, not a mistake)
     """Environments' processes died or fell silent too often: the run is saved and ends."""
 

@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 
 from merl.core import EnvironmentFailed, MerlError, NotFinite
 from merl.envs.adapted import in_one_line
-from merl.envs.own import adapt, make_own
+from merl.envs.own import adapt, load_module, make_own
 
 
 class Given(gymnasium.Env[Any, Any]):
@@ -135,15 +135,15 @@ def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> 
         "limit = 3\n"
         "gymnasium.register('Robot-v7', entry_point=make)\n"
     )
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
+    load_module("my_robot_here:make", tmp_path)
     assert make_own("my_robot_here:make").unwrapped.g == 1.0  # type: ignore[attr-defined]
     assert make_own("my_robot_here:Robot-v7", "rgb_array").render_mode is None
     for task, says in {
         "Pendulm-v1": "did you mean 'Pendulum-v1'",
         "reach_dulpo": "did you mean 'reach_duplo'",
         "zzz": "choose from reach_duplo, move_box, lift_box, or name a Gymnasium id",
-        "no_such_module:make": "call merl where it lies",
+        "no_such_module:make": "name its folder in PYTHONPATH",
         "my_robot_here:maker": "has no function 'maker'",
         "my_robot_here:limit": "a function is needed",
         "my_robot_here:number": "gave int",

@@ -63,10 +63,16 @@ def weights(run: Path) -> dict[str, object]:
 
 @pytest.mark.parametrize("flags", [("--num-envs", "3"), ("--no-synchronous",)])
 def test_a_run_with_workers_is_reproducible_and_keeps_its_ratio(
-    tmp_path: Path, flags: tuple[str, ...]
+    tmp_path: Path, flags: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    hostile = tmp_path / "hostile"  # a working folder whose modules no process imports
+    hostile.mkdir()
+    for name in ("multiprocessing", "pickle", "numpy", "gymnasium"):
+        (hostile / f"{name}.py").write_text("open('imported', 'w')")
+    monkeypatch.chdir(hostile)
     for run in ("one", "other"):
         assert train(tmp_path / run, "plain", *flags, steps=120) == 0
+    assert not (hostile / "imported").exists()
     assert weights(tmp_path / "one") == weights(tmp_path / "other")
     state = Checkpoint.find(Run.open(tmp_path / "one").checkpoints).state()
     assert state["progress"]["updates"] == (120 - 20) // 2

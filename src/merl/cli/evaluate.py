@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 
 from merl.cli.parsing import check_writable, parse, write_json
+from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
@@ -19,6 +20,7 @@ from merl.report.references import references
 from merl.training.console import describe
 from merl.training.evaluation import EVALUATION_SEED, load_policy
 from merl.training.evaluation import evaluate as evaluate_policy
+from merl.training.run import Run
 from merl.training.timing import use_threads
 from merl.training.video import MIN_SIDE
 
@@ -40,6 +42,9 @@ class EvaluateOptions:
     """latest, best (by evaluation return), or a number of steps."""
     renderer: RendererName | None = None
     """What draws the pictures, if not what the agent was trained with."""
+    trust: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Import the environment that the run names, although you have not trained this run here: that
+    runs the code of whoever made the run."""
     json: Path | None = None
     """Also write every episode's seed, return and success into this file."""
 
@@ -68,7 +73,9 @@ def evaluate(args: list[str]) -> int:
     if options.video is not None:
         size = max(policy.config.env.render_size, MIN_SIDE)
         changes |= {"render_mode": "rgb_array", "render_size": size}
-    env = policy.make_env(**changes)
+    if options.trust:
+        tell_trusted(Run.open(options.run))
+    env = policy.make_env(trust=options.trust, **changes)
     config = policy.config
     if options.max_episode_steps is not None:
         limited = dataclasses.replace(config.eval, max_episode_steps=options.max_episode_steps)

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
+from collections.abc import Collection
 from contextlib import ExitStack
 from datetime import timedelta
+from pathlib import Path
 
 from rich.console import Console
 from rich.filesize import decimal
 
 from merl.cli.summary import summarize
-from merl.core import MerlError, is_image
+from merl.core import MerlError, NotSaved, is_image
 from merl.replay import replay_bytes
 from merl.training import trainer
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
 from merl.training.console import ConsoleView
 from merl.training.environment import key_lines, own_bounds
-from merl.training.parts import Parts
-from merl.training.resuming import taken_up
-from merl.training.run import Run, resume_line
+from merl.training.parts import Parts, device_name
+from merl.training.resuming import REOPENED, left_open, reopened, taken_up
+from merl.training.run import Run
+from merl.training.run_folder import check_links, resume_line
+from merl.training.stretch import Outcome
 
 
 def begin(config: TrainConfig, what: str) -> int:
@@ -32,23 +37,44 @@ def begin(config: TrainConfig, what: str) -> int:
     return _train(config, what)
 
 
-def go_on(run: Run, asked: TrainConfig) -> int:
+def go_on(
+    run: Run,
+    asked: TrainConfig,
+    given_open: Collection[str] = (),
+    *,
+    trusted: bool = False,
+    named_in: Path | None = None,
+) -> int:
     """Train a run from its last whole checkpoint to its end; returns the exit code.
 
     Args:
-        run: which.
-        asked: the config with which it is to go on.
+        run: the run.
+        asked: the config with which it continues; fields that are left open keep their values.
+        given_open: fields that the user has left open by name, as with `--agent.precision auto`.
+        trusted: the environment that the run names may be imported; see `Run.load_module`.
+        named_in: the folder in which the user has named the task.
 
     Raises:
-        MerlError: that would be another run, another process trains it, or it has nothing to go on
-            from.
+        MerlError: that would be another run, another process trains it, it has nothing to go on
+            from, or its environment is not trusted.
     """
-    config, changes = taken_up(run.config, asked)
+    if asked.device == "auto" and "device" in given_open:
+        asked = dataclasses.replace(asked, device=device_name("auto"))
+    config, changes = taken_up(run.config, asked, given_open)
+    fixed = {name for name in REOPENED if name not in left_open(asked)}
+    run = dataclasses.replace(
+        run,
+        left_open=tuple(
+            name
+            for name in REOPENED
+            if name in given_open or (name in run.left_open and name not in fixed)
+        ),
+    )
     if run.has_moved() or config.device != run.config.device:
-        # What was decided for another machine or device is open again.
-        agent = dataclasses.replace(config.agent, precision="auto", torch_compile="auto")
-        config = dataclasses.replace(config, threads=None, agent=agent)
+        config = reopened(config, run.left_open)
+    check_links(run.path)
     with run.lock():
+        run.load_module(trusted=trusted, named_in=named_in)
         if run.begin_again():
             return _train(config, f"run {run.path} was ended before its first step", (run, None))
         start = Checkpoint.find(run.checkpoints)
@@ -68,6 +94,13 @@ def go_on(run: Run, asked: TrainConfig) -> int:
         if changes:
             what += f" with {', '.join(changes)}"
         return _train(config, what, (run, start))
+
+
+def tell_trusted(run: Run) -> None:
+    """Say which code `--trust` is going to import."""
+    origin = run.origin()
+    if origin is not None:
+        print(f"merl: --trust: importing {origin}", file=sys.stderr)
 
 
 def _train(
@@ -92,19 +125,39 @@ def _train(
             raise
     folder = outcome.run.path
     if outcome.signal is not None:
-        stopped = f"stopped at step {outcome.progress.step:,}"
-        how = (
-            "and saved: go on" if outcome.saved else "and not saved: go on from the last checkpoint"
-        )
-        console.print(f"{stopped} {how} with")
+        check_saved(outcome)
+        console.print(f"stopped at step {outcome.progress.step:,} and saved: go on with")
         console.print(f"    {resume_line(folder)}", highlight=False, soft_wrap=True)
         return 128 + outcome.signal
     try:
         summarize(outcome, console)
     except KeyboardInterrupt:
+        check_saved(outcome)
         console.print(f"{folder} is trained and saved", highlight=False, soft_wrap=True)
         raise
+    check_saved(outcome)
     return 0
+
+
+def check_saved(outcome: Outcome) -> None:
+    """Report what of a run's end is not on the disk.
+
+    Raises:
+        NotSaved: naming what is missing, its last checkpoint, or rows of its metrics.
+    """
+    run, rows = outcome.run, outcome.unwritten
+    lost = [] if outcome.saved else ["its checkpoint"]
+    lost += [f"{rows} rows of its metrics"] if rows else []
+    if not lost:
+        return
+    try:
+        last = f"step {Checkpoint.find(run.checkpoints).step:,}"
+    except MerlError:
+        last = "its start"
+    raise NotSaved(
+        f"{run.path} ended at step {outcome.progress.step:,}, but {' and '.join(lost)} could not "
+        f"be written: make room on the disk, then `{resume_line(run.path)}` continues from {last}"
+    )
 
 
 def _outlook(parts: Parts, what: str, done: int) -> str:

@@ -15,7 +15,7 @@ from merl.report.references import Reference, references
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env
 from merl.training.evaluation import Act, Evaluation, evaluate
-from merl.training.run import resume_line
+from merl.training.run_folder import resume_line
 from merl.training.stretch import Outcome
 
 FLOORS = ("random actions", "no motion")

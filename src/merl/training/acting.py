@@ -7,12 +7,14 @@ environments in processes of their own step while the learner learns.
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from threading import Timer
 from typing import Any, NamedTuple, Protocol
 
@@ -23,6 +25,7 @@ from gymnasium.vector.async_vector_env import AsyncState
 from numpy.typing import NDArray
 
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
+from merl.envs.own import load_module, module_folder
 from merl.training.config import TrainConfig
 from merl.training.environment import (
     EnvSpaces,
@@ -31,6 +34,7 @@ from merl.training.environment import (
     set_environment_state,
 )
 from merl.training.generators import seed_global_generators
+from merl.training.output import tolerate_lost_output
 
 _INFO = ("success", "reward_terms")
 """What the loop wants to know beside the reward."""
@@ -39,7 +43,8 @@ _TOLD = "told"
 _LEFT_TO_THE_RUN = (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
 """A terminal or a batch system sends them to the workers too, which are to work on until the run
 has saved and ends them. SIGTERM is what they are ended by."""
-
+_SAFE_PATH = "PYTHONSAFEPATH"
+"""With it Python leaves the working folder out of `sys.path`."""
 
 START_SECONDS = 300.0
 """In which all processes must have made their environments."""
@@ -264,13 +269,17 @@ class Workers:
     def _started(self) -> AsyncVectorEnv:
         self._lost = None
         expected = EnvSpaces.of(self._config, self._here)
-        makers = [_Maker(self._config, index, expected, self._here) for index in range(self.count)]
+        folder = module_folder(self._config.task)
+        makers = [
+            _Maker(self._config, index, expected, self._here, folder) for index in range(self.count)
+        ]
         others = multiprocessing.active_children()
         with (
             self._loss(),
             _killing_after(
                 START_SECONDS, lambda: set(multiprocessing.active_children()) - {*others}
             ),
+            _without_the_working_folder(),
         ):
             # What a worker raises is raised here; Gymnasium would print it, too.
             gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
@@ -289,6 +298,27 @@ def _killing_after(
         yield
     finally:
         impatience.cancel()
+
+
+@contextmanager
+def _without_the_working_folder() -> Iterator[None]:
+    """Start Python processes that do not look for modules in the working folder.
+
+    They are started by `python -c`, which searches it before the standard library.
+    """
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        _set_environment(_SAFE_PATH, before)
+
+
+def _set_environment(name: str, value: str | None) -> None:
+    if value is None:
+        os.environ.pop(name, None)
+    else:
+        os.environ[name] = value
 
 
 def _kill(processes: Iterable[BaseProcess]) -> None:
@@ -383,13 +413,21 @@ class _Maker:
     index: int
     expected: EnvSpaces
     here: gymnasium.Env[Any, Any] | None
+    folder: Path | None
+    """From which the module of a user's environment was loaded."""
+    safe_path: str | None = field(default_factory=lambda: os.environ.get(_SAFE_PATH))
+    """What the user set; the environment may start Python processes of its own."""
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
         if self.here is not None:
             return _StandIn(self.expected)
         for number in _LEFT_TO_THE_RUN:
             signal.signal(number, signal.SIG_IGN)
+        _set_environment(_SAFE_PATH, self.safe_path)
+        tolerate_lost_output()
         with _errors_that_arrive():
+            if self.folder is not None:
+                load_module(self.config.task, self.folder)
             env = make_run_env(self.config)
         try:
             self.expected.check(EnvSpaces.of(self.config, env), f"that of worker {self.index}")

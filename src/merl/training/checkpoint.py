@@ -13,8 +13,8 @@ import io
 import json
 import logging
 import os
-import pickle
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -178,7 +178,7 @@ def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
         MerlError: a file cannot be read, or belongs to other networks.
     """
     with _readable(checkpoint):
-        learner = torch.load(checkpoint.path / _LEARNER, map_location="cpu", weights_only=True)
+        learner = _learner(checkpoint)
         agent.load_state_dict({**_weights(checkpoint), **learner})
 
 
@@ -197,16 +197,41 @@ def _readable(checkpoint: Checkpoint) -> Iterator[None]:
     """What goes wrong in reading, in one line."""
     try:
         yield
+    except MerlError:
+        raise
     except (
         OSError,
         RuntimeError,
         ValueError,
         KeyError,
+        TypeError,
+        AttributeError,
         SafetensorError,
-        pickle.UnpicklingError,
     ) as error:
         why = " ".join(line.strip() for line in str(error).strip().split("\n")[:2])
         raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {why}") from None
+
+
+def _learner(checkpoint: Checkpoint) -> dict[str, Any]:
+    """Optimizers and generators: tensors and plain values only, nothing is unpickled.
+
+    Raises:
+        MerlError: the file holds something else. torch would advise to unpickle it all the same.
+    """
+    path = checkpoint.path / _LEARNER
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            learner = torch.load(path, map_location="cpu", weights_only=True)
+        if isinstance(learner, dict):
+            return learner
+    except OSError:
+        raise
+    except Exception:
+        pass
+    raise MerlError(
+        f"checkpoint {checkpoint.path} cannot be loaded: {_LEARNER} holds something else than the "
+        "tensors and plain values that merl writes; loading that could run code"
+    )
 
 
 def _weights(checkpoint: Checkpoint) -> dict[str, dict[str, torch.Tensor]]:

@@ -92,11 +92,18 @@ class Policy:
         result: NDArray[np.float32] = action.to("cpu", torch.float32).numpy()
         return result
 
-    def make_env(self, **changes: Any) -> gymnasium.Env[Any, Any]:
-        """The environment that the agent was trained in, with fields of `EnvConfig` changed.
+    def make_env(self, *, trust: bool = False, **changes: Any) -> gymnasium.Env[Any, Any]:
+        """Make the environment that the agent was trained in.
+
+        Args:
+            trust: import the environment that the run names, although you have not trained this
+                run on this machine: that runs the code of whoever made the run. Not needed for
+                merl's own tasks and Gymnasium's.
+            **changes: fields of `EnvConfig`, and `render_mode`.
 
         Raises:
-            MerlError: it cannot be made, or is no longer what the agent was trained in.
+            MerlError: it is not trusted, cannot be made, or is no longer what the agent was
+                trained in.
         """
         renderer = changes.get("renderer", self.config.env.renderer)
         if renderer != self.config.env.renderer and not self.config.own_env:
@@ -105,6 +112,8 @@ class Policy:
                 f"{renderer!r} now: these pictures differ, and it may do worse",
                 stacklevel=2,
             )
+        if self._run is not None:
+            self._run.load_module(trusted=trust)
         env = make_run_env(self.config, **changes)
         if self._run is not None and self.config.own_env:
             try:
@@ -289,7 +298,7 @@ def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
 
 
 def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:
-    """The policy that a run has learnt.
+    """The policy that a run has learnt; no code of the run is imported or executed.
 
     Args:
         run: the run's folder.

@@ -10,7 +10,8 @@ from merl.envs.adapted import in_one_line
 from merl.training.evaluation import Evaluation, Policy, evaluate
 from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
-from merl.training.run import Run, resume_line
+from merl.training.run import Run
+from merl.training.run_folder import resume_line
 from merl.training.signals import Interrupt
 
 if TYPE_CHECKING:

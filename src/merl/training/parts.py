@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import torch
@@ -18,13 +18,15 @@ from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
 from merl.core import MerlError
+from merl.envs.own import load_module
 from merl.replay import check_fits
 from merl.resources import available_memory, keep_freed_memory
 from merl.training.config import TrainConfig
 from merl.training.env_checks import check_instances
 from merl.training.environment import EnvSpaces, make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness
-from merl.training.run import refuse_existing, run_path
+from merl.training.resuming import left_open
+from merl.training.run_folder import refuse_existing, run_path
 from merl.training.timing import measure, use_threads
 from merl.training.video import MIN_SIDE
 
@@ -34,6 +36,7 @@ class Parts:
 
     Attributes:
         config: with `device`, `threads`, the agent's `precision` and `torch_compile` decided.
+        left_open: names of the fields that this machine has decided.
         timing: what this machine needs for a step and an update.
         env: to act in.
         eval_env: to be evaluated in; None where there are no evaluations (`eval.every` is 0).
@@ -63,13 +66,14 @@ class Parts:
         timed = config
         if eval_env is None:
             timed = dataclasses.replace(config, eval=dataclasses.replace(config.eval, video="none"))
+        self.left_open = left_open(config)
         self.timing = measure(timed, env, eval_env or env, self.space, self.device)
         best = self.timing.best
         use_threads(best.threads)
         self.config = dataclasses.replace(
             config,
             threads=best.threads,
-            device="cuda" if self.device.type == "cuda" else "cpu",
+            device=device_name(config.device),
             agent=best.decided(config.agent),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
@@ -89,7 +93,8 @@ class Parts:
 
         Args:
             config: of the run.
-            new: the run begins, so its folder must not exist and its replay must fit.
+            new: the run begins, so its folder must not exist and its replay must fit; the module of
+                a user's environment is looked for in the working folder.
 
         Raises:
             MerlError: a device, renderer, sense, folder or size that is not to be had.
@@ -104,6 +109,8 @@ class Parts:
         home = Path.cwd()  # before any user code runs, which may change it
         if new:
             refuse_existing(run_path(config, home))
+            if config.own_env and ":" in config.task:
+                load_module(config.task, home)
         with ExitStack() as stack:
             env = make_run_env(config)
             stack.callback(env.close)
@@ -142,6 +149,11 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda":  # a run's shapes never change: trying every way to convolve once pays
         torch.backends.cudnn.benchmark = True
     return torch.device(name)
+
+
+def device_name(name: str) -> Literal["cpu", "cuda"]:
+    """The name of the device that `choose_device` chooses."""
+    return "cuda" if choose_device(name).type == "cuda" else "cpu"
 
 
 def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.Box) -> None:

@@ -105,8 +105,9 @@ class Interrupt:
             self.note(number)
         # A closed terminal sends SIGHUP twice, and saving takes a moment.
         elif number != signal.SIGHUP and time.monotonic() - self._at > _APART:
-            if sys.stdout.isatty():  # the live view hides it
-                os.write(sys.stdout.fileno(), SHOW_CURSOR.encode())
+            with suppress(OSError, ValueError):  # the terminal is gone
+                if sys.stdout.isatty():  # the live view hides it
+                    os.write(sys.stdout.fileno(), SHOW_CURSOR.encode())
             os._exit(128 + number)
 
 

@@ -9,11 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from merl.core import (
-    EnvironmentFailed,
-    EnvironmentsLost,
-    is_image,
-)
+from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, is_image
 from merl.replay import Lanes
 from merl.training import checkpoint
 from merl.training.acting import Environments, Lost
@@ -27,7 +23,8 @@ from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
 from merl.training.plain import to_plain
 from merl.training.rollout import FrameStack, mean_metrics, report_success
-from merl.training.run import Run, resume_line
+from merl.training.run import Run
+from merl.training.run_folder import resume_line
 from merl.training.signals import Interrupt
 from merl.training.updating import make_update
 
@@ -68,6 +65,7 @@ class Outcome:
         evaluation: the last one, if there was any.
         signal: what interrupted it; None if it ran to its end.
         saved: whether its last checkpoint is on the disk.
+        unwritten: rows of metrics that could not be written.
     """
 
     run: Run
@@ -75,6 +73,7 @@ class Outcome:
     evaluation: Evaluation | None
     signal: int | None
     saved: bool
+    unwritten: int = 0
 
 
 class Stretch:
@@ -148,9 +147,12 @@ class Stretch:
         evaluates = parts.eval_env is not None
         if evaluates and not parts.films and self.config.eval.video != "none":
             self.view.warn("there will be no videos: the environment does not render to an array")
-        if progress.step == 0:
-            self._save()  # from here on there is something to go on from
-        elif self.evaluations.are_due() and not self.replay.state_dict()["open"]:
+        if progress.step == 0 and not self._save():  # there must be something to go on from
+            raise MerlError(
+                f"no checkpoint can be written into {self.run.path}: make room on its disk, or "
+                "name a folder on another with --run-dir"
+            )
+        if progress.step and self.evaluations.are_due() and not self.replay.state_dict()["open"]:
             self._evaluate()  # the run was left before it or within it
             self._save()
         self.clock.mark(progress)

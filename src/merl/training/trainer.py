@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from contextlib import ExitStack
 
 from merl.replay import Lanes
@@ -18,17 +17,16 @@ from merl.training.stretch import Outcome, Stretch, View
 
 
 def start(parts: Parts, view: View) -> Outcome:
-    """Begin a new run; if it fails before its first step, its folder is removed again."""
-    run = Run.create(
-        parts.config, parts.space, parts.action_space, own_bounds(parts.env), home=parts.home
-    )
-    try:
-        with run.lock():
+    """Begin a new run; if it fails before its first step, nothing is left of it."""
+    bounds = own_bounds(parts.env)
+    space, actions, names = parts.space, parts.action_space, parts.left_open
+    with Run.begin(parts.config, space, actions, bounds, names, home=parts.home) as run:
+        try:
             return _train(parts, run, None, view)
-    except BaseException:
-        if parts.progress.step == 0:
-            shutil.rmtree(run.path, ignore_errors=True)
-        raise
+        except BaseException:
+            if parts.progress.step == 0:
+                run.discard()
+            raise
 
 
 def resume(parts: Parts, run: Run, point: Checkpoint | None, view: View) -> Outcome:
@@ -59,4 +57,5 @@ def _train(parts: Parts, run: Run, point: Checkpoint | None, view: View) -> Outc
         if point is not None:
             stretch.restore(point)
             run.record_resumption(point.step)
-        return stretch.train()
+        outcome = stretch.train()
+    return dataclasses.replace(outcome, unwritten=metrics.unwritten)

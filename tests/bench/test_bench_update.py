@@ -135,7 +135,7 @@ def test_the_reference_makes_the_same_update(agent: str, layers: int) -> None:
 
 def test_it_runs_and_shows_every_side(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(*_: object) -> None:
-        raise MerlError('not installed: pip install "merl[bench]"')
+        raise MerlError('not installed: pip install "merl-rl[bench]"')
 
     monkeypatch.setattr(bench, "_stable_baselines", missing)
     result = bench.run(repeats=1, batch_size=2)
@@ -147,7 +147,7 @@ def test_it_runs_and_shows_every_side(monkeypatch: pytest.MonkeyPatch) -> None:
     with console.capture() as capture:
         console.print(bench.table(result))
     shown = capture.get()
-    assert 'not installed: pip install "merl[bench]"' in " ".join(shown.split())
+    assert 'not installed: pip install "merl-rl[bench]"' in " ".join(shown.split())
     for side in (bench.REFERENCE, f"{bench.OURS}, bf16", bench.DRQV2, f"{bench.OUR_DRQV2}, fp32"):
         assert result["updates_per_s"][side]["median"] > 0
         assert side in shown

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 
+from merl.cli.output import make_console
 from merl.cli.parsing import check_writable, parse, write_json
 from merl.cli.summary import comparison
 from merl.core import MerlError
@@ -52,7 +52,7 @@ def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
     options = parse(EvaluateOptions, "merl evaluate", args)
     check_writable(options.json)
-    console = Console(markup=False)
+    console = make_console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     # As the run had it: several threads wait for each other where the machine does other work, too.
     use_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))

@@ -10,14 +10,14 @@ from rich.table import Table
 
 from merl.core import MerlError
 from merl.report.figures import learning_curve
-from merl.report.references import Reference, references
+from merl.report.references import RANDOM, Reference, references
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env
 from merl.training.evaluation import Act, Evaluation, evaluate
 from merl.training.run import resume_line
 from merl.training.stretch import Outcome
 
-FLOORS = ("random actions", "no motion")
+FLOORS = (RANDOM, "no motion")
 """The references that need no skill."""
 ENOUGH = 5
 """Episodes of an evaluation, below which its interval says nothing."""
@@ -30,7 +30,9 @@ def summarize(outcome: Outcome, console: Console) -> None:
         return
     beside = references(run.config.task, run.config.env)
     if not beside and run.config.eval.references:
-        with console.status(f"what {' and '.join(FLOORS)} are paid, to compare with"):
+        with console.status(
+            f"what {' and '.join(FLOORS)} are paid, to compare with", spinner="line"
+        ):
             beside = _measured(run.config, console)
     console.print()
     console.print(comparison(run.config.task, trained, beside))

@@ -7,10 +7,11 @@ set -uo pipefail
 
 say() { printf '  %d:%02d  %s\n' $((SECONDS / 60)) $((SECONDS % 60)) "$1"; }
 
-now='looking for the packages'
+now='looking for the packages' begun=
 PYTHONUNBUFFERED=1 "$1" install --disable-pip-version-check --no-color --progress-bar off "${@:2}" |
     while true; do
         if IFS= read -r -t "${INSTALL_INTERVAL:-10}" line; then
+            line=$begun$line begun=
             case $line in
                 *Downloading\ *.whl*|*'Using cached '*.whl*|*Processing\ *.whl*)
                     file=${line#*Downloading }
@@ -32,7 +33,8 @@ PYTHONUNBUFFERED=1 "$1" install --disable-pip-version-check --no-color --progres
                 'Successfully installed'*)
                     say 'installed' ;;
             esac
-        elif (($? > 128)); then # nothing was said for ten seconds
+        elif (($? > 128)); then # no whole line came for ten seconds
+            begun+=$line
             say "$now"
         else
             break

@@ -9,7 +9,6 @@ from rich.console import Console
 from rich.table import Table
 
 from merl.core import MerlError
-from merl.report.figures import learning_curve
 from merl.report.references import RANDOM, Reference, references
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env
@@ -28,6 +27,8 @@ def summarize(outcome: Outcome, console: Console) -> None:
     run, trained = outcome.run, outcome.evaluation
     if trained is None:
         return
+    from merl.report.figures import learning_curve  # here, for Matplotlib is slow to import
+
     beside = references(run.config.task, run.config.env)
     if not beside and run.config.eval.references:
         with console.status(

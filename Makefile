@@ -6,6 +6,7 @@ PYTHON := $(shell for p in python3.12 python3.11; do "$$p" --version >/dev/null 
 VENV := .venv
 BIN := $(VENV)/bin
 MINUTES := 10
+PYTEST_FLAGS := --numprocesses 2 --dist worksteal --durations 10
 
 .PHONY: help setup train test test-all clean
 
@@ -29,14 +30,14 @@ test: setup
 	@$(BIN)/ruff format --check src tests
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
-	@$(BIN)/pytest -m "not long" --numprocesses 2 --dist loadfile
+	@$(BIN)/pytest -m "not long" $(PYTEST_FLAGS)
 
 test-all: setup
 	@$(BIN)/ruff check src tests
 	@$(BIN)/ruff format --check src tests
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
-	@$(BIN)/pytest --numprocesses 2 --dist loadfile
+	@$(BIN)/pytest $(PYTEST_FLAGS)
 
 clean:
 	rm -rf $(VENV)

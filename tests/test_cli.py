@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.image import imread
+from rich.console import Console
 
 import merl
 from helpers import flat, wait_for
@@ -170,6 +172,13 @@ def train_the_dot(folder: Path, *more: str) -> list[str]:
     return train_arguments(folder, *few, *more, task="merl.envs.dot:whole")
 
 
+def last_saved(run: Path) -> int:
+    """The step of the last checkpoint; 0 without one."""
+    folder = run / "checkpoints"
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    return max((int(name) for name in names if name.isdigit()), default=0)
+
+
 def weights(run: Path) -> dict[str, torch.Tensor]:
     from safetensors.torch import load_file
 
@@ -218,7 +227,7 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code:
     assert process.returncode == code, err
     assert "Traceback" not in err
     assert f"merl resume {folder}" in out
-    saved = max(int(p.name) for p in (folder / "checkpoints").iterdir() if p.name.isdigit())
+    saved = last_saved(folder)
     assert saved >= 80
     assert main(["resume", str(folder), "--steps", str(saved + 50)]) == 0
     steps = [int(row["step"]) for row in rows(folder)]
@@ -231,13 +240,13 @@ def test_one_process_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     command = [*MERL, *train_the_dot(folder, "--steps", "2000000", "--eval.every", "100")]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        wait_for(lambda: any((folder / "checkpoints").glob("*100")), process)
+        wait_for(lambda: last_saved(folder) > 0, process)
         assert main(["resume", str(folder)]) == 2
         assert f"process {process.pid} is training in" in capsys.readouterr().err
     finally:
         process.kill()
         process.wait()
-    last = max(int(p.name) for p in (folder / "checkpoints").iterdir() if p.name.isdigit())
+    last = last_saved(folder)
     assert main(["resume", str(folder), "--steps", str(last + 20)]) == 0
     record = json.loads((folder / "config.json").read_text())
     assert record["config"]["steps"] == last + 20
@@ -246,8 +255,8 @@ def test_one_process_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert "is done" in capsys.readouterr().out
 
     before = (folder / "config.json").read_bytes()
-    assert main(["resume", str(folder), "--steps", "30"]) == 2
-    assert "--steps 30 is less than" in capsys.readouterr().err
+    assert main(["resume", str(folder), "--steps", "33"]) == 2
+    assert "--steps 33 is less than" in capsys.readouterr().err
     shutil.rmtree(folder / "replay")
     assert main(["resume", str(folder), "--steps", "3000000"]) == 2
     assert "replay is gone" in capsys.readouterr().err
@@ -264,6 +273,23 @@ def test_minutes_end_a_run_in_time(tmp_path: Path, capsys: pytest.CaptureFixture
     row = rows(tmp_path / "run")[-1]
     assert row["eval/return"] != ""
     assert int(row["step"]) < 2_000_000
+
+
+def test_lines_to_paste_are_whole_on_a_narrow_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=60, markup=False)
+    monkeypatch.setattr("merl.cli.running.make_console", lambda: console)
+    folder = tmp_path / "a folder with a name that is longer than a narrow terminal" / "run"
+    folder.parent.mkdir()
+    assert main(train_the_dot(folder, "--steps", "60")) == 0
+    assert isinstance(console.file, io.StringIO)
+    shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", console.file.getvalue())
+    assert f"merl resume '{folder}' --steps 120" in shown
+    assert f"learning curve: {folder}/curve.png" in shown
+    outlook = shown[shown.index("preset smoke") : shown.index("the replay takes")]
+    assert all(len(line) <= 60 for line in outlook.splitlines())
+    assert flat(outlook).startswith("preset smoke (as asked for; the whole pipeline in under")
 
 
 def test_what_cannot_learn_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -235,7 +235,7 @@ def sparkline(values: Sequence[float], low: float, high: float, levels: str = SP
 def _earlier_returns(run: Run) -> list[float]:
     """The mean returns of a resumed run's evaluations so far; empty for a new one."""
     try:
-        with (run.path / METRICS_FILE).open(newline="") as file:
+        with (run.path / METRICS_FILE).open(newline="", encoding="utf-8") as file:
             return [
                 float(row["eval/return"]) for row in csv.DictReader(file) if row.get("eval/return")
             ]

@@ -12,8 +12,8 @@ import torch
 
 # For the processes that tests start: two test processes share two cores, and what a command prints
 # must not depend on the terminal that the tests are run in.
-os.environ["OMP_NUM_THREADS"] = "1"
-for _name in ("COLUMNS", "LINES", "FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+os.environ |= {"OMP_NUM_THREADS": "1", "COLUMNS": "80", "LINES": "25"}
+for _name in ("FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
     os.environ.pop(_name, None)
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)

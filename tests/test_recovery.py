@@ -35,7 +35,7 @@ def line(folder: Path, *more: str) -> list[str]:
         "--agent.hidden-dim": 32,
         "--random-steps": 100,
         "--seed-steps": 100,
-        "--updates-per-step": 0.5,
+        "--updates-per-step": 0.25,
         "--save-every": 0,
         "--eval.every": 200,
         "--eval.episodes": 2,

@@ -228,7 +228,9 @@ def test_a_signal_to_all_processes_saves(tmp_path: Path, number: int) -> None:
     assert cli.main(["resume", str(run), "--minutes", "0.02"]) == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+)
 def test_a_signal_while_workers_start_ends_it_at_once(tmp_path: Path, number: int) -> None:
     run = tmp_path / "run"
     with started(run, "never_ready", "--steps", "100", "--num-envs", "2") as process:

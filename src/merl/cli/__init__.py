@@ -19,7 +19,6 @@ from importlib import import_module
 from typing import Any
 
 import merl
-from merl.cli.output import allow_any_character
 from merl.core import MerlError, meant
 
 # The modules are imported when called: a misspelt command should not wait for torch.
@@ -36,7 +35,6 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     args = list(sys.argv[1:] if arguments is None else arguments)
-    allow_any_character()
     warnings.showwarning = _show_warning
     logging.basicConfig(format="merl: %(levelname)s: %(message)s", level=logging.WARNING)
     logging.addLevelName(logging.WARNING, "warning")

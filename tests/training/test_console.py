@@ -197,6 +197,15 @@ def test_before_the_first_evaluation_its_step_is_shown() -> None:
     assert "compare with" not in shown  # nothing is known
 
 
+def test_a_training_episode_without_success_counts_as_failed() -> None:
+    view = ConsoleView(console_of(terminal=False))
+    view.begin(new_run(), 0)
+    silent = {name: value for name, value in METRICS.items() if "success" not in name}
+    for step, metrics in enumerate((METRICS, silent, silent, silent)):
+        view.moment(Moment(step, 0), metrics)
+    assert "success 25%" in drawn(view)
+
+
 def test_a_resumed_run_shows_its_earlier_evaluations(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("step,train/return,eval/return\n10,1,\n20,2,0.0\n")
     view = ConsoleView(console_of(terminal=False))

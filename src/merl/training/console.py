@@ -74,7 +74,8 @@ class ConsoleView:
         self._step = step
         self._learning_starts = config.seed_steps
         self._returns = _earlier_returns(run)
-        self._evaluation = f"the first one after step {config.eval.every:,}, or at the end"
+        every = config.eval.every
+        self._evaluation = f"the first one after step {every:,}, or at the end" if every else ""
         self._start = self._printed = time.perf_counter()
         if self._is_live:
             self._live.start()
@@ -190,9 +191,9 @@ class ConsoleView:
     def _recent_training(self, updates: int) -> str:
         """Return and success of the last training episodes, which include exploration noise."""
         values = f"return {mean(row['train/return'] for row in self._recent):.1f}"
-        ends = [row["train/success_end"] for row in self._recent if "train/success_end" in row]
-        if ends:
-            values += f", success {mean(ends):.0%}"
+        name = "train/success_end"
+        if any(name in row for row in self._recent):  # a row without it failed
+            values += f", success {mean(row.get(name, 0.0) for row in self._recent):.0%}"
         count = len(self._recent)
         about = f"the last {count} episodes, with noise" if count > 1 else "one episode, with noise"
         if not updates:

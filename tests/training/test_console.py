@@ -115,6 +115,8 @@ def test_elsewhere_there_are_plain_lines(encoding: str) -> None:
     lines = shown.splitlines()
     assert lines[0] == "returns to compare with: random actions 7.8, scripted expert 219.4"
     assert lines[1].startswith("evaluation at step 250: return 1.5 [1.0, 2.0], success 50%")
+    assert lines[1].endswith("; at first an agent is often below random actions")
+    assert "below" not in lines[2]
     high = "█" if encoding == "utf-8" else "#"
     assert lines[3].startswith("returns of all evaluations: ")
     assert f"{high} (scale: 1.5 to 219.4)" in lines[3]

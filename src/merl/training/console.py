@@ -118,7 +118,7 @@ class ConsoleView:
         self._returns = [*self._returns, evaluation.returns.mean]
         self._evaluation = f"at step {step:,}: {describe(evaluation)}"
         if not self._is_live:
-            self._print(f"evaluation {self._evaluation}")
+            self._print(f"evaluation {self._evaluation}{self._excuse()}")
             if len(self._returns) > 1:
                 self._print(f"returns of all evaluations: {self._sparkline()}")
 
@@ -201,13 +201,16 @@ class ConsoleView:
         return f"{values} ({about})"
 
     def _compared(self) -> str:
-        """The returns to compare with; why the agent may be below the lowest of them."""
+        """The returns to compare with; why the agent's may be below all of them."""
         names = ", ".join(f"{name} {value:.1f}" for name, value in self._scale.items())
-        latest = self._returns[-1] if self._returns else self._training_return
-        if self._scale and latest is not None and latest < min(self._scale.values()):
-            lowest = min(self._scale, key=lambda name: self._scale[name])
-            return f"{names}; at first an agent is often below {lowest}"
-        return names
+        return f"{names}{self._excuse()}"
+
+    def _excuse(self) -> str:
+        """Why the newest return may be below all that it is compared with; empty if it is not."""
+        newest = self._returns[-1] if self._returns else self._training_return
+        if newest is None or not self._scale or newest >= min(self._scale.values()):
+            return ""
+        return f"; at first an agent is often below {min(self._scale, key=self._scale.__getitem__)}"
 
     def _sparkline(self) -> str:
         """The returns of all evaluations, from the lowest to the highest that is shown."""

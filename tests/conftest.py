@@ -12,7 +12,7 @@ import torch
 
 # For the processes that tests start: two test processes share two cores, and what a command prints
 # must not depend on the terminal that the tests are run in.
-os.environ |= {"OMP_NUM_THREADS": "1", "COLUMNS": "80", "LINES": "25"}
+os.environ |= {"OMP_NUM_THREADS": "1", "COLUMNS": "80", "LINES": "25", "TERM": "xterm"}
 for _name in ("FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
     os.environ.pop(_name, None)
 

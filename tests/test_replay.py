@@ -10,7 +10,6 @@ import mmap
 import os
 import resource
 import tempfile
-import time
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +22,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from helpers import wait_for
 from merl.core import Batch, MerlError, Observation, Transition
 from merl.replay import Lanes, Replay, ReplayConfig, check_fits, pictures, replay_bytes, storage
 from merl.replay.pictures import ReadAhead
@@ -329,10 +329,7 @@ def test_pictures_that_are_on_the_disk_alone_are_fetched(tmp_path):
             end = np.array([9000, 50, 101 * mmap.PAGESIZE, pages * mmap.PAGESIZE])
             ReadAhead.ask(mapped, begin, end)
             wanted = {5000 // mmap.PAGESIZE, 9000 // mmap.PAGESIZE, 100, *range(290, pages)}
-            deadline = time.monotonic() + 10
-            while not wanted <= in_memory(mapped) and time.monotonic() < deadline:
-                time.sleep(0.01)
-            assert wanted <= in_memory(mapped)
+            wait_for(lambda: wanted <= in_memory(mapped))
 
 
 def in_memory(mapped: mmap.mmap) -> set[int]:

@@ -247,7 +247,7 @@ def _stable_baselines(batch_size: int, device: torch.device) -> Work:
         from stable_baselines3.common.logger import Logger
         from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
     except ImportError:
-        raise MerlError('not installed: pip install "merl[bench]"') from None
+        raise MerlError('not installed: pip install "merl-rl[bench]"') from None
 
     class Extractor(BaseFeaturesExtractor):  # type: ignore[misc]
         """The convolutions and the joints, side by side."""

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 
+from merl.cli.output import make_console
 from merl.cli.parsing import check_writable, parse, write_json
 from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
@@ -65,7 +65,7 @@ def evaluate(args: list[str]) -> int:
     # Absolute before any user code runs, which may change the working folder.
     file, film = _absolute(options.json), _absolute(options.video)
     check_writable(file)
-    console = Console(markup=False)
+    console = make_console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     # As the run had it: several threads wait for each other where the machine does other work, too.
     use_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 import merl
 from merl.bench.renderers import renderer_speeds
+from merl.cli.output import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError
 from merl.experiments.presets import compose
@@ -29,9 +29,9 @@ def info(args: list[str]) -> int:
         """Show what this machine offers, measured here (takes half a minute)."""
 
     parse(command, "merl info", args)
-    console = Console(markup=False)
+    console = make_console()
     table = Table(show_header=False, box=None, padding=(0, 2))
-    with console.status("measuring"):
+    with console.status("measuring", spinner="line"):
         for name, value in _rows():
             table.add_row(name, value)
     console.print(table, highlight=False)

@@ -9,12 +9,13 @@ from contextlib import ExitStack
 from datetime import timedelta
 from pathlib import Path
 
-from rich.console import Console
 from rich.filesize import decimal
 
+from merl.cli.output import make_console
 from merl.cli.summary import summarize
 from merl.core import MerlError, NotSaved, is_image
 from merl.replay import replay_bytes
+from merl.report.references import EXPERT, RANDOM, references
 from merl.training import trainer
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
@@ -106,16 +107,16 @@ def tell_trusted(run: Run) -> None:
 def _train(
     config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint | None] | None = None
 ) -> int:
-    console = Console(markup=False)
+    console = make_console()
     with ExitStack() as stack:
         try:
-            with console.status("building the scene and timing this machine"):
+            with console.status("building the scene and timing this machine", spinner="line"):
                 parts = stack.enter_context(Parts.prepare(config, new=resumed is None))
             if resumed:
                 resumed[0].check_environment(parts.space, parts.action_space, own_bounds(parts.env))
             done = resumed[1].step if resumed and resumed[1] else 0
             console.print(_outlook(parts, what, done), highlight=False)
-            with ConsoleView(console) as view:
+            with ConsoleView(console, _scale(config)) as view:
                 if resumed:
                     outcome = trainer.resume(parts, *resumed, view)
                 else:
@@ -158,6 +159,15 @@ def check_saved(outcome: Outcome) -> None:
         f"{run.path} ended at step {outcome.progress.step:,}, but {' and '.join(lost)} could not "
         f"be written: make room on the disk, then `{resume_line(run.path)}` continues from {last}"
     )
+
+
+def _scale(config: TrainConfig) -> dict[str, float]:
+    """The returns that the live view shows beside the agent's; none for an unknown environment."""
+    return {
+        reference.name: reference.returns.mean
+        for reference in references(config.task, config.env)
+        if reference.name in (RANDOM, EXPERT)
+    }
 
 
 def _outlook(parts: Parts, what: str, done: int) -> str:

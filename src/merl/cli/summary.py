@@ -10,15 +10,14 @@ from rich.table import Table
 
 from merl.core import MerlError
 from merl.envs.adapted import in_one_line
-from merl.report.figures import learning_curve
-from merl.report.references import Reference, references
+from merl.report.references import RANDOM, Reference, references
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env
 from merl.training.evaluation import Act, Evaluation, evaluate
 from merl.training.run_folder import resume_line
 from merl.training.stretch import Outcome
 
-FLOORS = ("random actions", "no motion")
+FLOORS = (RANDOM, "no motion")
 """The references that need no skill."""
 ENOUGH = 5
 """Episodes of an evaluation, below which its interval says nothing."""
@@ -30,9 +29,13 @@ def summarize(outcome: Outcome, console: Console) -> None:
     The run is saved: what fails here is told in one line, and the rest goes on.
     """
     run, trained = outcome.run, outcome.evaluation
+    from merl.report.figures import learning_curve  # here, for Matplotlib is slow to import
+
     beside = references(run.config.task, run.config.env)
     if trained is not None and not beside and run.config.eval.references:
-        with console.status(f"what {' and '.join(FLOORS)} are paid, to compare with"):
+        with console.status(
+            f"what {' and '.join(FLOORS)} are paid, to compare with", spinner="line"
+        ):
             beside = _measured(run.config, console, trained.success_end is not None)
     if trained is not None:
         console.print()

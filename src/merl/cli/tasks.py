@@ -11,6 +11,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from merl.cli.output import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError
 from merl.envs import make_env
@@ -35,7 +36,7 @@ def tasks(args: list[str]) -> int:
         return pictures
 
     folder = parse(command, "merl tasks", args)
-    console = Console(markup=False)
+    console = make_console()
     for name in TASKS:
         picture = _picture(name)
         console.print(_entry(name, picture, console), highlight=False)
@@ -59,7 +60,11 @@ def _entry(name: str, picture: NDArray[np.uint8], console: Console) -> Table:
     if name in BOX_TASKS:
         lines.append(Text(f"merl train {name} --occluded   (a disc hides the object)"))
     entry = Table.grid(padding=(0, 2))
-    shows_pictures = console.color_system is not None and console.width >= 2 * PICTURE_WIDTH
+    shows_pictures = (
+        console.color_system is not None
+        and "utf" in (console.encoding or "").lower()
+        and console.width >= 2 * PICTURE_WIDTH
+    )
     entry.add_row(*([_blocks(picture)] if shows_pictures else []), Group(*lines, Text()))
     return entry
 

@@ -26,7 +26,9 @@ CLEARANCE = 0.004
 SCENE_CLEARANCE = 0.006
 """The same for what is fixed, but for the floor, which may be near but not be touched, m."""
 SUNK = 5e-4
-"""What lies on the floor sinks into it by less, m."""
+"""The resting object sinks into the floor by less than this, m."""
+FLOOR_CLEARANCE = 1e-3
+"""The robot keeps this distance from the floor, m: a finger that scrapes along it does not close."""
 DAMPING = 0.02
 """Of the least squares, m: bounds the step near singular poses."""
 LEVER = 0.15
@@ -184,22 +186,23 @@ class Kinematics:
             path.append(found)
         return path
 
-    def is_free(self, path: Path, held: Pose | None = None) -> bool:
-        """Whether the arm touches nothing along a path, its start aside.
+    def is_free(self, path: Path, held: Pose | None = None, *, lifted: bool = False) -> bool:
+        """Return whether the arm touches nothing along a path, its start excepted.
 
         Args:
-            path: of at least one q; of a single one, that one is looked at.
-            held: the object's pose in the hand's frame; it moves along and may touch the hand.
-                None where it stays where it is.
+            path: at least one q; a single q is checked itself.
+            held: pose of a held object in the hand's frame: it moves with the hand and may touch
+                it. None: the object stays where it is.
+            lifted: the held object must also keep its distance from the floor.
         """
         for a, b in zip(path, path[1:] or path, strict=False):
             count = max(int(np.ceil(np.abs(b - a).max() / CHECK_STEP)), 1)
             for i in range(1, count + 1):
-                if self._touches(a + (b - a) * i / count, held):
+                if self._touches(a + (b - a) * i / count, held, lifted):
                     return False
         return True
 
-    def _touches(self, q: Array, held: Pose | None) -> bool:
+    def _touches(self, q: Array, held: Pose | None, lifted: bool) -> bool:
         prop = self._data.qpos[self._prop_qpos]
         prop[:] = self._resting
         hand = self.pose(q)
@@ -211,8 +214,9 @@ class Kinematics:
         contact = self._data.contact
         pairs = contact.geom  # (contacts, 2)
         robot, moved = self._is_robot[pairs].any(axis=1), self._is_prop[pairs].any(axis=1)
-        deep = (contact.dist < -SUNK) | ~self._is_floor[pairs].any(axis=1)
-        return bool((deep & (robot if held is None else robot != moved)).any())
+        nearest = np.where(robot, FLOOR_CLEARANCE, np.inf if lifted else -SUNK)
+        close = (contact.dist < nearest) | ~self._is_floor[pairs].any(axis=1)
+        return bool((close & (robot if held is None else robot != moved)).any())
 
     def seconds(self, path: Path) -> float:
         """How long a path takes at full speed."""

@@ -22,9 +22,8 @@ FAR_GOAL_MARGIN = 0.3
 """In place of that, where the reward is to tell from afar which way the goal is: it falls off in a
 straight line, to 0 at this distance more, m."""
 VERTICAL_COSINE = 0.99
-"""1 - epsilon_vertical: the hand points down when the cosine of its tilt is at least this."""
-VERTICAL_MARGIN = 0.99
-"""Below it the reward falls off as a gaussian of this width, in units of the cosine."""
+"""1 - epsilon_vertical: the hand points down when the cosine of its tilt is at least this; below it
+the reward falls off as a gaussian whose margin is the same number."""
 FLOATING_HEIGHT = 0.035
 """epsilon_floating: the object is off the floor when its centre is above this, m."""
 
@@ -85,7 +84,7 @@ def lift(
         height: of the object's centre above the floor, m.
         target_height: of the target above the floor, m, above 0.
         goal_distance: from the object to its target, m.
-        vertical_cosine: 1 - epsilon_vertical, from which on the hand counts as vertical.
+        vertical_cosine: 1 - epsilon_vertical: bound and margin of the vertical term.
         goal: how far the reward for the object's place reaches.
 
     Returns:
@@ -121,4 +120,4 @@ def _at_goal(distance: float, goal: GoalReward) -> float:
 
 def _upright(cosine: float, enough: float) -> float:
     bounds = (enough, float("inf"))  # a cosine may exceed 1 by a rounding error
-    return float(tolerance(cosine, bounds, margin=VERTICAL_MARGIN, sigmoid="gaussian"))
+    return float(tolerance(cosine, bounds, margin=enough, sigmoid="gaussian"))

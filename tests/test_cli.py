@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -120,6 +121,14 @@ def test_evaluating_with_the_other_renderer_warns(run: Path) -> None:
         policy.make_env(renderer="gl", observations=("proprio",)).close()
 
 
+def test_auto_is_the_renderer_of_the_training(run: Path, recwarn: pytest.WarningsRecorder) -> None:
+    policy = merl.load_policy(run)
+    env = policy.make_env(renderer="auto", observations=("proprio",))
+    assert env.unwrapped.config.renderer == policy.config.env.renderer == "warp"  # type: ignore[attr-defined]
+    env.close()
+    assert not list(recwarn)
+
+
 def _closing_gl():  # type: ignore[no-untyped-def]
     """Without an OpenGL library the environment is refused after the warning, which is enough."""
     import contextlib
@@ -225,7 +234,9 @@ def test_minutes_end_a_run_in_time(tmp_path: Path, capsys: pytest.CaptureFixture
     arguments = train_arguments(tmp_path / "run", "--steps", "100000", "--minutes", "0.05")
     assert main(arguments) == 0
     shown = capsys.readouterr().out
-    assert "0.05 minutes, or 100,000 steps, of reach_duplo" in shown
+    assert "0.05 minutes of reach_duplo on cpu (100,000 steps would take about" in " ".join(
+        shown.split()
+    )
     assert f"resume {tmp_path / 'run'}" in shown
     row = rows(tmp_path / "run")[-1]
     assert row["eval/return"] != ""
@@ -431,11 +442,16 @@ def test_tasks_are_listed_with_pictures(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["tasks", "--pictures", str(tmp_path / "pictures")]) == 0
     told = capsys.readouterr().out
     for task, env_id in ENV_IDS.items():
-        assert f"merl train {task}" in told
-        assert f"gymnasium.make('merl:{env_id}')" in told
+        assert f"\n    merl train {task} --preset laptop\n" in told
+        make = f"import gymnasium; env = gymnasium.make('merl:{env_id}')"
+        assert f"\n    {make}\n" in told
+        made: dict[str, Any] = {}
+        exec(make, made)
+        made["env"].close()
         assert imread(tmp_path / "pictures" / f"{task}.png").shape == (480, 480, 3)
     assert "reaching + vertical + floating + lifting" in told
-    assert "merl train move_box --occluded" in told
+    lines = [line.strip() for line in told.splitlines()]
+    assert "merl train move_box --preset laptop --occluded" in lines
     (tmp_path / "file").write_text("in the way")
     assert main(["tasks", "--pictures", str(tmp_path / "file")]) == 2
     assert "cannot be written" in capsys.readouterr().err

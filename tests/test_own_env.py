@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, ClassVar
 
 import av
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 import merl
 from merl.cli import main
 from merl.training.evaluation import EVALUATION_SEED
+from toy import DotEnv
 
 TWO_CAMERAS = '''
 import gymnasium
@@ -75,7 +77,9 @@ def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
         assert "Traceback" not in done.stderr
         return done.stdout + done.stderr
 
-    said_all = call("train", "my_arm:Arm", *SHORT)  # d = 128: 42 for each of three senses
+    said_all = call(
+        "train", "my_arm:Arm", *SHORT, "--eval.references"
+    )  # d = 128: 42 for each of three senses
     assert "'gear' is not used" in said_all
     assert "there will be no videos" in said_all
     assert "random actions" in said_all
@@ -125,11 +129,53 @@ def test_who_waits_for_the_end_of_an_episode_is_told(
 ) -> None:
     """Those of the dot have 20 steps."""
     monkeypatch.setattr("merl.training.stretch.LONG", long)
-    short = [*SHORT, "--agent", "proprio", "--eval.no-references", "--run-dir", str(tmp_path / "r")]
+    short = [*SHORT, "--agent", "proprio", "--run-dir", str(tmp_path / "r")]
     assert main(["train", "merl.envs.dot:whole", *short]) == 0
     assert main(["resume", str(tmp_path / "r"), "--steps", "280"]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert ("no episode has ended in" in out) == told
+
+
+class Logged(DotEnv):
+    """Logs every call that would move a robot."""
+
+    calls: ClassVar[list[str]] = []
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.render_mode = render_mode
+
+    def reset(self, **options: Any) -> Any:
+        self.calls.append("reset")
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        self.calls.append("step")
+        return super().step(action)
+
+
+def moves(tmp_path: Path, *flags: str) -> tuple[int, int]:
+    """Train for 100 steps of ten to an episode, evaluate two episodes; returns resets and steps."""
+    Logged.calls.clear()
+    arguments = ["train", "test_own_env:Logged", "--agent", "proprio", *SHORT, "--steps", "100"]
+    arguments += ["--eval.episodes", "2", "--agent.hidden-dim", "8", "--replay.batch-size", "8"]
+    assert main([*arguments, *flags, "--run-dir", str(tmp_path / "-".join(["run", *flags]))]) == 0
+    return Logged.calls.count("reset"), Logged.calls.count("step")
+
+
+def test_nothing_but_training_and_evaluation_moves_a_users_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    assert moves(tmp_path, "--eval.video", "none") == (10 + 2, 100 + 20)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "100 steps of test_own_env:Logged on cpu (how long they take is said after" in said
+    assert "49 steps of test_own_env:Logged on cpu take about 0:00:0" in said
+    assert "nothing to compare with (--eval.references takes 20 episodes" in said
+    assert moves(tmp_path) == (10 + 2 + 1, 100 + 20)  # whether it can be filmed
+    assert moves(tmp_path, "--eval.video", "none", "--eval.references") == (12 + 40, 120 + 400)
+    resets, steps = moves(tmp_path, "--eval.video", "none", "--measure")
+    assert (resets > 12, steps) == (True, 120 + 75)
 
 
 @pytest.mark.parametrize("agent", ["ddpg", "sac", "merl_state"])
@@ -255,7 +301,7 @@ def test_an_arm_that_has_become_another_is_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     task = failing(tmp_path, "never")
-    short = [*SHORT, "--eval.video", "none", "--eval.no-references"]
+    short = [*SHORT, "--eval.video", "none"]
     assert main(["train", task, *short, "--run-dir", "run"]) == 0
     assert "there is nothing to compare with" in capsys.readouterr().out
     module = Path("arm_that_fails_never.py")

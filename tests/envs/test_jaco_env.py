@@ -183,7 +183,7 @@ def test_a_bad_action_moves_nothing(blind, action, message):
         (
             "reach_duplo",
             {"renderer": "vulkan"},
-            "'vulkan' is unknown: choose from gl, warp",
+            "'vulkan' is unknown: choose from auto, gl, warp",
         ),
         ("reach_duplo", {"proprio": "some"}, "proprio 'some' is unknown"),
         ("reach_duplo", {"image_size": 15}, "image_size is 15: .* at least 16"),
@@ -244,9 +244,16 @@ def test_gymnasium_makes_every_task():
         env.close()
 
 
+def test_auto_renderer_is_replaced_before_anything_records_it():
+    assert EnvConfig().renderer == EnvConfig(renderer="auto").renderer == "warp"
+    assert EnvConfig(renderer="gl").renderer == "gl"
+    with pytest.raises(MerlError, match="renderer"):
+        EnvConfig(renderer="vulkan")
+
+
 def test_every_setting_is_a_plain_value():
     assert {field.name: field.default for field in fields(EnvConfig)} == {
-        "renderer": "gl",
+        "renderer": "auto",
         "image_size": 84,
         "proprio": "paper",
         "state": "absolute",

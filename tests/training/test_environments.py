@@ -117,7 +117,7 @@ def test_a_worker_that_is_lost_is_started_again(
     monkeypatch.setenv("TIMES", "1")
     flags = ["--num-envs", "2", "--worker-timeout", "2"]
     assert train(tmp_path / "run", how, *flags) == 0
-    assert "starting the environments again (1 of 10 times)" in " ".join(
+    assert "starting the environments again (restart 1 of 10)" in " ".join(
         capfd.readouterr().out.split()
     )
     metrics = read_metrics(tmp_path / "run")
@@ -133,7 +133,7 @@ def test_workers_that_are_lost_too_often_end_the_run_with_a_checkpoint(
     run = tmp_path / "run"
     assert train(run, "dies", "--no-synchronous", "--worker-restarts", "1") == 4
     said = " ".join(capfd.readouterr().err.split())
-    assert "an environment's process died, after 1 restarts: the run is saved at step 48" in said
+    assert "an environment's process died, after 1 restart: the run is saved at step 48" in said
     assert Checkpoint.find(Run.open(run).checkpoints).step == 48
     assert cli.main(["resume", str(run)]) == 0
     assert Checkpoint.find(Run.open(run).checkpoints).step == 100

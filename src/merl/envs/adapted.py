@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from merl.core import EnvironmentFailed, MerlError, NotFinite, is_image, is_vector
+from merl.core import EnvironmentFailed, MerlError, NotFinite, counted, is_image, is_vector
 
 MOST_CHANNELS = 4
 """Of an image whose channels come last; with more, the smaller end has them."""
@@ -206,7 +206,7 @@ def in_one_line(error: BaseException) -> str:
 def _apart(what: str, given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
     """What a call must give, as a tuple of so many."""
     if not isinstance(given, tuple) or len(given) != len(names):
-        many = f"{len(given)} values" if isinstance(given, tuple) else type(given).__name__
+        many = counted(len(given), "value") if isinstance(given, tuple) else type(given).__name__
         raise EnvironmentFailed(
             f"the environment's {what} gave {many}: it must return {', '.join(names)}"
         )

@@ -12,6 +12,7 @@ import tyro
 from merl.agents import AGENTS
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
+from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 from merl.training.config import EvaluationConfig, Setting, TrainConfig
 
@@ -38,7 +39,7 @@ class Preset:
 PRESETS: dict[str, Preset] = {
     "paper": Preset(
         "Table 1, OpenGL pictures: for a machine with CUDA",
-        TrainConfig(_TASK),
+        TrainConfig(_TASK, env=EnvConfig(renderer="gl")),
     ),
     "laptop": Preset(
         "made for 2 cores without a GPU: learns in about an hour",  # docs/laptop.md
@@ -158,7 +159,15 @@ def compose(
     name = agent or chosen.agent_name
     check_choice("agent", name, tuple(AGENTS))
     check_choice("setting", setting, get_args(Setting))
-    config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
+    is_merls = task in ENV_IDS  # a user's environment may be a robot: nothing moves it unasked
+    config = dataclasses.replace(
+        chosen.config,
+        task=task,
+        preset=preset,
+        setting=setting,
+        measure=is_merls,
+        eval=dataclasses.replace(chosen.config.eval, references=is_merls),
+    )
     values = dict(chosen.agent)
     base = AGENTS[name]
     if preset == "paper" and base.head_norm:

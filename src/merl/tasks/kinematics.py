@@ -28,7 +28,7 @@ SCENE_CLEARANCE = 0.006
 SUNK = 5e-4
 """The resting object sinks into the floor by less than this, m."""
 FLOOR_CLEARANCE = 1e-3
-"""The robot keeps this distance from the floor, m: a finger that scrapes along it does not close."""
+"""The robot keeps this distance from the floor, m: a finger that scrapes over it does not close."""
 DAMPING = 0.02
 """Of the least squares, m: bounds the step near singular poses."""
 LEVER = 0.15

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
-from merl.core import MerlError
+from merl.core import MerlError, counted
 from merl.replay import check_fits
 from merl.resources import available_memory, keep_freed_memory
 from merl.training.config import TrainConfig
@@ -69,6 +69,7 @@ class Parts:
             frame_stack=config.replay.frame_stack,
             seed=self.randomness.agent,
             device=self.device,
+            threads=best.threads,
         )
 
     @classmethod
@@ -87,7 +88,8 @@ class Parts:
         processors = os.cpu_count() or 1
         if config.threads is not None and config.threads > processors:
             raise MerlError(
-                f"threads is {config.threads}, but this machine has {processors} processors: "
+                f"threads is {config.threads}, but this machine has "
+                f"{counted(processors, 'processor')}: "
                 f"give at most {processors}"
             )
         if new:
@@ -106,7 +108,9 @@ class Parts:
                     lanes=config.num_envs,
                 )
             size = max(config.env.render_size, MIN_SIDE)
-            eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)
+            # Whether a user's environment renders takes a reset to find out.
+            mode = None if config.own_env and config.eval.video == "none" else "rgb_array"
+            eval_env = make_run_env(config, render_mode=mode, render_size=size)
             stack.callback(eval_env.close)
             yield cls(config, env, eval_env)
 

@@ -234,9 +234,8 @@ def test_minutes_end_a_run_in_time(tmp_path: Path, capsys: pytest.CaptureFixture
     arguments = train_arguments(tmp_path / "run", "--steps", "100000", "--minutes", "0.05")
     assert main(arguments) == 0
     shown = capsys.readouterr().out
-    assert "0.05 minutes of reach_duplo on cpu (100,000 steps would take about" in " ".join(
-        shown.split()
-    )
+    said = " ".join(shown.split())  # a terminal wraps it
+    assert "0.05 minutes of reach_duplo on cpu (100,000 steps would take about" in said
     assert f"resume {tmp_path / 'run'}" in shown
     row = rows(tmp_path / "run")[-1]
     assert row["eval/return"] != ""

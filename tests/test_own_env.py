@@ -77,9 +77,8 @@ def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
         assert "Traceback" not in done.stderr
         return done.stdout + done.stderr
 
-    said_all = call(
-        "train", "my_arm:Arm", *SHORT, "--eval.references"
-    )  # d = 128: 42 for each of three senses
+    # d = 128: 42 for each of three senses
+    said_all = call("train", "my_arm:Arm", *SHORT, "--eval.references")
     assert "'gear' is not used" in said_all
     assert "there will be no videos" in said_all
     assert "random actions" in said_all

@@ -34,6 +34,29 @@ def test_an_action_asks_for_the_experts_velocities():
     np.testing.assert_allclose(env.physics.data.ctrl, velocities, rtol=0, atol=1e-6)
 
 
+def test_expert_follows_an_environment_that_is_closed_and_opened_again():
+    def actions(env, policy):
+        env.reset(seed=5)
+        policy.reset()
+        taken = []
+        for _ in range(3):
+            taken.append(policy(None))
+            env.step(taken[-1])
+        return np.array(taken)
+
+    env = make_env("reach_duplo", observations=("proprio",))
+    policy = ExpertPolicy(env)
+    expected = actions(env, policy)
+    env.close()
+    with pytest.raises(MerlError, match=r"call reset\(\) first"):
+        policy(None)
+    np.testing.assert_array_equal(actions(env, policy), expected)
+    env.close()
+    env.reset(seed=5)  # no policy.reset(): the episode is a new one all the same
+    np.testing.assert_array_equal(policy(None), expected[0])
+    env.close()
+
+
 def test_a_foreign_environment_is_met_with_one_sentence():
     with pytest.raises(MerlError, match="there is no expert for"):
         ExpertPolicy(gymnasium.make("Pendulum-v1"))

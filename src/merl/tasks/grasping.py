@@ -22,7 +22,7 @@ FINGERS_MIDDLE = -0.011
 STRAIGHT = 0.2
 """How far the hand goes at most straight to a box, and straight back with it, m."""
 STRAIGHT_STEPS = 2
-"""Of the approach at least: `LINE_STEP` each."""
+"""Of the approach at least, where there is room: `LINE_STEP` each."""
 TOP = 0.36
 """Up to here the hand may rise on its way, m."""
 UNREACHED = 10.0
@@ -32,7 +32,11 @@ TURNS = tuple(np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 18
 OFF_CENTRE = 100.0
 """What a metre off the middle of the box costs, s/m: the grip is less sure."""
 BRIDGES = 80
-"""So many connections, the fastest first, are looked at for collisions."""
+"""Number of direct connections, the fastest first, that are checked for collisions."""
+DETOURS = 400
+"""Number of connections over one random pose that are checked where no direct one is free."""
+DETOUR_SPREAD = 0.5
+"""Standard deviation of that pose around the direct connection, rad."""
 TRIED = 2
 """At least this many grasps, the most promising first, are planned before the fastest is taken."""
 FAST = 5.0
@@ -162,27 +166,50 @@ def find_carry(arm: Kinematics, q: Array, held: Pose, goal: Array, upright: bool
 def _connected(
     arm: Kinematics, starts: list[Path], ends: list[Path], held: Pose | None = None
 ) -> Path | None:
-    """The fastest path along one of `starts`, straight over to one of `ends`, and back along it."""
+    """Return the fastest free path along one of `starts`, over to one of `ends`, and back along it.
+
+    It goes over straight or, where that is not free, by way of one other pose of the arm.
+    """
     if not starts or not ends:
         return None
     here, there = (np.array([path[-1] for path in paths]) for paths in (starts, ends))
-    costs = arm.durations(here[:, None] - there)  # (starts, ends)
-    costs += np.array([arm.seconds(path) for path in starts])[:, None]
-    costs += np.array([arm.seconds(path) for path in ends])
-    for index in np.argsort(costs, axis=None, kind="stable")[:BRIDGES]:
-        start, end = starts[index // len(ends)], ends[index % len(ends)]
-        path = [*start, *end[::-1]]
-        if not arm.is_free([start[-1], end[-1]], held, lifted=True):
-            continue
-        if arm.is_free(list(arm.timed(path)[::3]), held):  # its corners are rounded
+    along = np.array([arm.seconds(path) for path in starts])[:, None]
+    along = along + np.array([arm.seconds(path) for path in ends])  # (starts, ends)
+    direct = along + arm.durations(here[:, None] - there)
+    for index in np.argsort(direct, axis=None, kind="stable")[:BRIDGES]:
+        path = _joined(arm, starts[index // len(ends)], [], ends[index % len(ends)], held)
+        if path is not None:
+            return path
+    rng = np.random.default_rng(0)  # the same scene gives the same path
+    start, end = rng.integers(len(starts), size=DETOURS), rng.integers(len(ends), size=DETOURS)
+    by_way_of = here[start] + rng.random((DETOURS, 1)) * (there[end] - here[start])
+    by_way_of = arm.within_limits(by_way_of + rng.normal(0.0, DETOUR_SPREAD, by_way_of.shape))
+    costs = arm.durations(here[start] - by_way_of) + arm.durations(by_way_of - there[end])
+    for i in np.argsort(costs + along[start, end], kind="stable"):
+        path = _joined(arm, starts[start[i]], [by_way_of[i]], ends[end[i]], held)
+        if path is not None:
             return path
     return None
 
 
+def _joined(
+    arm: Kinematics, start: Path, middle: Path, end: Path, held: Pose | None
+) -> Path | None:
+    """Join a path, poses between, and another path backwards; None unless all of it is free."""
+    path = [*start, *middle, *end[::-1]]
+    if not arm.is_free([start[-1], *middle, end[-1]], held, lifted=True):
+        return None
+    corners_rounded = list(arm.timed(path)[::3])
+    return path if arm.is_free(corners_rounded, held) else None
+
+
 def _ways_off(arm: Kinematics, q: Array, held: Pose | None, least: int) -> list[Path]:
-    """At least so many steps straight back from where the hand points, then straight up."""
+    """Return paths that go straight back from where the hand points, then straight up.
+
+    They go back by `least` steps or more, or as far as there is room.
+    """
     line = arm.line(q, -STRAIGHT * arm.pose(q).rotation[:, 2], held)
-    backs = [line[: i + 1] for i in range(least, len(line))]
+    backs = [line[: i + 1] for i in range(min(least, len(line) - 1), len(line))]
     return [rise for back in backs for rise in _rises(arm, back, held)]
 
 

@@ -166,6 +166,11 @@ class Kinematics:
             q = np.clip(q + change, self._low, self._high)
         return None
 
+    def within_limits(self, q: Array) -> Array:
+        """Return joint angles (..., 6), rad, brought within the joints' limits."""
+        limited: Array = np.clip(q, self._low, self._high)
+        return limited
+
     def line(self, q: Array, offset: Array, held: Pose | None = None) -> Path:
         """Move the hand straight by (3,), m, without turning it, as far as it can and is free.
 

@@ -16,7 +16,11 @@ from gymnasium.envs.registration import registry
 
 from merl.core import MerlError, meant
 from merl.envs.adapted import adapt, failing, in_one_line
+from merl.envs.packages import installing
 from merl.envs.registration import ENV_IDS
+
+CLOSE = 0.8
+"""How similar an unknown id must be to a known one to be a mistyped form of it."""
 
 
 def make_own(task: str, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
@@ -69,8 +73,8 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
         raise MerlError(f"task {task!r} is merl's own: call it {known}")
     if not colon:
         if task not in registry:
-            way = meant(task, [*ENV_IDS, *registry])
-            if not way.startswith("did"):
+            way = installing(task) or meant(task, [*ENV_IDS, *registry], CLOSE)
+            if not way.startswith(("did", "it comes")):
                 way = f"choose from {', '.join(ENV_IDS)}, or name a Gymnasium id or module:function"
             raise MerlError(f"task {task!r} is unknown: {way}")
         return _by_id(task, render_mode)
@@ -79,9 +83,10 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
     if make is None:
         if name in registry:
             return _by_id(name, render_mode)
+        way = meant(name, registry, CLOSE)
         raise MerlError(
             f"task {task!r}: module {module!r} has no function {name!r}, and registers no "
-            "environment of that name"
+            f"environment of that name{f': {way}' if way.startswith('did') else ''}"
         )
     env = _called(task, make, render_mode)
     if not isinstance(env, gymnasium.Env):
@@ -103,9 +108,9 @@ def _imported(task: str, module: str) -> ModuleType:
             raise MerlError(
                 f"task {task!r}: {module!r} imports {error.name!r}, which is not installed here"
             ) from None
-        raise MerlError(
-            f"task {task!r}: {error}: call merl where it lies, or name its folder in PYTHONPATH"
-        ) from None
+        way = installing(task.partition(":")[2], module)
+        way = way or "call merl where it lies, or name its folder in PYTHONPATH"
+        raise MerlError(f"task {task!r}: {error}: {way}") from None
     except Exception as error:
         raise MerlError(
             f"task {task!r}: importing {module!r} failed: {in_one_line(error)}"

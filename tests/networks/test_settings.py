@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+import merl
 from merl.agents import AGENTS, make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.merl import MERLConfig
 from merl.cli import main
-from merl.core import Transition
+from merl.core import MerlError, Transition
 from merl.networks.settings import torch_settings
 from merl.replay import Lanes, ReplayConfig
 from merl.training import checkpoint
@@ -207,22 +208,47 @@ class Disturbing(DotEnv):
         return super().step(action)
 
 
-def test_run_learns_the_same_beside_an_environment_that_sets_torch(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A run beside an environment that sets torch, and one beside the same that does not."""
     flags = ["--preset", "smoke", "--threads", "1", "--agent.precision", "fp32"]
     flags += ["--steps", "40", "--random-steps", "20", "--seed-steps", "20"]
     flags += ["--replay.batch-size", "8", "--eval.every", "30", "--eval.episodes", "1"]
     flags += ["--eval.video", "none", "--agent.hidden-dim", "8", "--agent.latent-dim", "8"]
     flags += ["--agent.shift-pad", "1", "--agent.conv-channels", "4", "--agent.conv-strides"]
     flags += ["2", "1", "1", "1"]
-    weights = []
-    for name in ("Disturbing", "DotEnv"):
-        run = tmp_path / name
-        with disturbed("none"):  # restores what the environment leaves behind
-            assert main(["train", f"test_settings:{name}", *flags, "--run-dir", str(run)]) == 0
-            assert main(["resume", str(run), "--steps", "50"]) == 0
-            assert main(["evaluate", str(run), "--episodes", "1"]) == 0
-        weights.append((run / "checkpoints/00000050/weights.safetensors").read_bytes())
+    folders = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parent))
+        for name in ("Disturbing", "DotEnv"):
+            run = tmp_path_factory.mktemp("runs") / name
+            with disturbed("none"):  # restores what the environment leaves behind
+                assert main(["train", f"test_settings:{name}", *flags, "--run-dir", str(run)]) == 0
+                assert main(["resume", str(run), "--steps", "50"]) == 0
+                assert main(["evaluate", str(run), "--episodes", "1"]) == 0
+            folders.append(run)
+    return folders
+
+
+def test_run_learns_the_same_beside_an_environment_that_sets_torch(runs: list[Path]) -> None:
+    weights = [(run / "checkpoints/00000050/weights.safetensors").read_bytes() for run in runs]
     assert weights[0] == weights[1]
+
+
+@pytest.mark.parametrize(("threads", "used"), [({}, 1), ({"threads": None}, 2)])
+def test_loaded_policy_acts_on_one_thread_by_default(
+    threads: dict[str, Any], used: int, runs: list[Path]
+) -> None:
+    torch.set_num_threads(2)
+    policy = merl.load_policy(runs[1], **threads)
+    seen: list[int] = []
+    agent: Any = policy._agent
+    agent.networks.actor.register_forward_hook(lambda *_: seen.append(torch.get_num_threads()))
+    policy(DotEnv().reset(seed=0)[0])
+    assert (seen, torch.get_num_threads()) == ([used], 2)
+
+
+@pytest.mark.parametrize("threads", [0, -1, 1.5, True, "two"])
+def test_number_of_threads_is_checked(threads: Any, tmp_path: Path) -> None:
+    with pytest.raises(MerlError, match="threads is"):
+        merl.load_policy(tmp_path, threads=threads)

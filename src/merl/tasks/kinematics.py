@@ -24,7 +24,9 @@ Path = list[Array]
 CLEARANCE = 0.004
 """What is nearer than this touches, m: the arm strays a little from its plan."""
 SCENE_CLEARANCE = 0.006
-"""The same for what is fixed, but for the floor, which may be near but not be touched, m."""
+"""The robot's distance from what is fixed, the floor excepted, m."""
+HELD_CLEARANCE = 0.015
+"""The same for a held object, which moves in the grip and lags behind with the hand, m."""
 SUNK = 5e-4
 """The resting object sinks into the floor by less than this, m."""
 FLOOR_CLEARANCE = 1e-3
@@ -93,7 +95,7 @@ class Kinematics:
     def __init__(self, task: JacoTask, physics: mjcf.Physics) -> None:
         model: Any = copy.copy(physics.model.ptr)
         model.geom_margin[:] = CLEARANCE
-        model.geom_margin[model.geom_bodyid == 0] = SCENE_CLEARANCE
+        model.geom_margin[model.geom_bodyid == 0] = HELD_CLEARANCE
         self._model, self._data = model, mujoco.MjData(model)
         joints = physics.bind(task.arm.joints).element_id
         fingers = physics.bind(task.hand.joints).element_id
@@ -107,6 +109,7 @@ class Kinematics:
         self._low, self._high = np.where(self._turns_freely, unlimited, model.jnt_range[joints].T)
         self.max_velocity: Array = model.actuator_ctrlrange[: len(joints), 1].copy()
         self._is_floor = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        self._is_scene = (model.geom_bodyid == 0) & ~self._is_floor
         self._is_robot, self._is_prop = np.zeros((2, model.ngeom), dtype=bool)
         self._is_robot[physics.bind(task.arm.mjcf_model.find_all("geom")).element_id] = True
         self._is_prop[physics.bind(task.prop.mjcf_model.find_all("geom")).element_id] = True
@@ -219,8 +222,12 @@ class Kinematics:
         contact = self._data.contact
         pairs = contact.geom  # (contacts, 2)
         robot, moved = self._is_robot[pairs].any(axis=1), self._is_prop[pairs].any(axis=1)
-        nearest = np.where(robot, FLOOR_CLEARANCE, np.inf if lifted else -SUNK)
-        close = (contact.dist < nearest) | ~self._is_floor[pairs].any(axis=1)
+        clearance = np.full(len(pairs), CLEARANCE)
+        scene, floor = (fixed[pairs].any(axis=1) for fixed in (self._is_scene, self._is_floor))
+        clearance[scene] = np.where(moved, HELD_CLEARANCE, SCENE_CLEARANCE)[scene]
+        on_floor = SCENE_CLEARANCE if lifted else -SUNK
+        clearance[floor] = np.where(moved, on_floor, FLOOR_CLEARANCE)[floor]
+        close = contact.dist < clearance
         return bool((close & (robot if held is None else robot != moved)).any())
 
     def seconds(self, path: Path) -> float:

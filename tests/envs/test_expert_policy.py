@@ -22,6 +22,33 @@ def test_evaluate_finds_the_task_solved():
     assert result.returns.low > 150.0
 
 
+def solves(task, seed, **form):
+    env = make_env(task, observations=("proprio",), **form)
+    policy = ExpertPolicy(env)
+    observation, _ = env.reset(seed=seed)
+    over = False
+    while not over:
+        observation, _, _, over, info = env.step(policy(observation))
+    env.close()
+    return info["success"] == 1.0
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(77002, id="box scrapes along the floor"),
+        pytest.param(600006, id="fast plans need a detour"),
+        pytest.param(600019, id="finger scrapes along the floor"),
+    ],
+)
+def test_expert_solves_occluded_starts_that_need_care(seed):
+    assert solves("move_box", seed, occluded=True)
+
+
+def test_expert_keeps_a_carried_box_off_the_disc():
+    assert solves("lift_box", 77053, occluded=True)
+
+
 def test_an_action_asks_for_the_experts_velocities():
     env = make_env("reach_duplo", observations=("proprio",))
     policy = ExpertPolicy(env)

@@ -231,7 +231,7 @@ class Arm(gymnasium.Env):
 
     def step(self, action):
         self.taken += 1
-        if WHEN == "step" and self.taken == 250:
+        if WHEN == "step" and self.taken == 175:
             raise OSError("servo 3 does not answer")
         if WHEN == "evaluation" and self.taken == 40 and self.render_mode:
             return {"joints": np.full(4, np.nan, np.float32)}, 0.0, False, False, {}
@@ -273,7 +273,7 @@ def test_what_the_users_code_raises_is_told_and_the_run_saved(
     saved = max(int(path.name) for path in Path("run/checkpoints").iterdir())
     assert saved > 0
     module = Path("arm_that_fails_step.py")
-    module.write_text(module.read_text().replace("self.taken == 250", "False"))
+    module.write_text(module.read_text().replace("self.taken == 175", "False"))
     sys.modules.pop("arm_that_fails_step")
     assert main(["resume", "run"]) == 0
     assert rows(Path("run"))[-1]["step"] == "240"

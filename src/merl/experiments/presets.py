@@ -12,7 +12,6 @@ import tyro
 from merl.agents import AGENTS
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
-from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 from merl.training.config import EvaluationConfig, Setting, TrainConfig
 
@@ -159,15 +158,10 @@ def compose(
     name = agent or chosen.agent_name
     check_choice("agent", name, tuple(AGENTS))
     check_choice("setting", setting, get_args(Setting))
-    is_merls = task in ENV_IDS  # a user's environment may be a robot: nothing moves it unasked
-    config = dataclasses.replace(
-        chosen.config,
-        task=task,
-        preset=preset,
-        setting=setting,
-        measure=is_merls,
-        eval=dataclasses.replace(chosen.config.eval, references=is_merls),
-    )
+    config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
+    if not config.own_env:  # a user's environment may be a robot, which nothing moves unasked
+        evaluation = dataclasses.replace(config.eval, references=True)
+        config = dataclasses.replace(config, eval=evaluation)
     values = dict(chosen.agent)
     base = AGENTS[name]
     if preset == "paper" and base.head_norm:

@@ -69,8 +69,8 @@ class TrainConfig:
     steps: int = 1_000_000
     """Environment steps."""
     measure: bool = False
-    """Time the environment before the run begins, with some 75 random steps. Set for merl's own
-    tasks; on an environment of your own the first steps of the run are timed instead."""
+    """Time an environment of your own before the run begins, as merl's own tasks are, with 75
+    random steps; if not set, the first steps of the run are timed."""
     minutes: float | None = None
     """Stop after this many minutes (since start or resume), if the steps are not done before."""
     run_dir: Path | None = None

@@ -1,8 +1,7 @@
 """What this machine needs for an update and for a step: measured once, before a run begins.
 
-Updates and acting are timed with synthetic observations. The environment's step is timed only where
-`TrainConfig.measure` allows it: a user's own environment may be a robot, which must not move before
-the run begins.
+Updates and acting are timed with synthetic observations. A user's own environment is only
+timed if `TrainConfig.measure` is set: it may be a robot, which must not move before the run begins.
 """
 
 from __future__ import annotations
@@ -118,8 +117,8 @@ def measure(
 ) -> Timing:
     """Time the update in every way that the config leaves open, and the environment's step.
 
-    Precision first, on one thread; then the fastest on all threads, or on a GPU compiled. The
-    environments are only touched if `config.measure` is set.
+    Precision first, on one thread; then the fastest on all threads, or on a GPU compiled. A
+    user's own environments are only touched if `config.measure` is set.
 
     Raises:
         MerlError: the update is to be compiled, and cannot be.
@@ -155,11 +154,12 @@ def measure(
     use_threads(threads)
     with torch_settings(device):
         step, frame = _time_acting(agent, batch), 0.0
-    if config.measure:
+    knows_env = config.measure or not config.own_env
+    if knows_env:
         films = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
         frame = _time_frame(eval_env) if films else 0.0
         step += _time_step(env)
-    timing = Timing(update, step, frame, knows_env=config.measure)
+    timing = Timing(update, step, frame, knows_env=knows_env)
     if not worth_compiling(config, timing, device):
         return timing
     print("merl: trying torch.compile, once, for a minute or two", file=sys.stderr)

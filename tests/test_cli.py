@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -163,6 +164,14 @@ def test_evaluating_with_the_other_renderer_warns(run: Path) -> None:
         policy.make_env(renderer="gl", observations=("proprio",)).close()
 
 
+def test_auto_is_the_renderer_of_the_training(run: Path, recwarn: pytest.WarningsRecorder) -> None:
+    policy = merl.load_policy(run)
+    env = policy.make_env(renderer="auto", observations=("proprio",))
+    assert env.unwrapped.config.renderer == policy.config.env.renderer == "warp"  # type: ignore[attr-defined]
+    env.close()
+    assert not list(recwarn)
+
+
 def _closing_gl():  # type: ignore[no-untyped-def]
     """Without an OpenGL library the environment is refused after the warning, which is enough."""
     return contextlib.suppress(merl.core.MerlError)
@@ -283,7 +292,7 @@ def test_minutes_end_a_run_in_time(tmp_path: Path, capsys: pytest.CaptureFixture
     arguments = train_the_dot(tmp_path / "run", "--steps", "2000000", "--minutes", "0.02")
     assert main(arguments) == 0
     shown = flat(capsys.readouterr().out)
-    assert "0.02 minutes" in shown
+    assert "0.02 minutes of merl.envs.dot:whole on cpu (2,000,000 steps would take about" in shown
     assert f"resume {tmp_path / 'run'}" in shown
     row = rows(tmp_path / "run")[-1]
     assert row["eval/return"] != ""
@@ -497,11 +506,16 @@ def test_tasks_are_listed_with_pictures(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["tasks", "--pictures", str(tmp_path / "pictures")]) == 0
     told = capsys.readouterr().out
     for task, env_id in ENV_IDS.items():
-        assert f"merl train {task}" in told
-        assert f"gymnasium.make('merl:{env_id}')" in told
+        assert f"\n    merl train {task} --preset laptop\n" in told
+        make = f"import gymnasium; env = gymnasium.make('merl:{env_id}')"
+        assert f"\n    {make}\n" in told
+        made: dict[str, Any] = {}
+        exec(make, made)
+        made["env"].close()
         assert imread(tmp_path / "pictures" / f"{task}.png").shape == (480, 480, 3)
     assert "reaching + vertical + floating + lifting" in told
-    assert "merl train move_box --occluded" in told
+    lines = [line.strip() for line in told.splitlines()]
+    assert "merl train move_box --preset laptop --occluded" in lines
     (tmp_path / "file").write_text("in the way")
     assert main(["tasks", "--pictures", str(tmp_path / "file")]) == 2
     assert "cannot be written" in capsys.readouterr().err

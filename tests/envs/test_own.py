@@ -271,7 +271,7 @@ def test_what_is_usual_is_taken() -> None:
 
 def test_an_old_reset_is_told() -> None:
     given = Misgiving(reset=({"arm": np.zeros(2)},))
-    with pytest.raises(EnvironmentFailed, match="reset gave 1 values: it must return observation"):
+    with pytest.raises(EnvironmentFailed, match="reset gave 1 value: it must return observation"):
         adapt(given).reset()
 
 

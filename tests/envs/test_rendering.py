@@ -223,9 +223,16 @@ def test_warp_needs_no_opengl_and_says_nothing_at_exit(warp_env):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_warp_works_where_the_opengl_asked_for_is_missing(warp_env):
-    done = run(HIDE_OPENGL + STEP.format(renderer="warp"), MUJOCO_GL="egl")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+def test_default_environment_works_where_the_opengl_asked_for_is_missing(warp_env):
+    code = """
+    import gymnasium, merl
+    for env in (gymnasium.make("merl:merl/ReachDuplo-v0"), merl.make_env("reach_duplo")):
+        assert env.reset(seed=0)[0]["image"].std() > 20
+        print(env.unwrapped.config.renderer)
+        env.close()
+    """
+    done = run(HIDE_OPENGL + textwrap.dedent(code), MUJOCO_GL="egl")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "warp\nwarp\n", "")
 
 
 HIDE_OPENGL = """

@@ -226,3 +226,8 @@ def test_an_evaluation_in_one_line() -> None:
     line = describe(summarize(episodes()))
     assert line.startswith("return 1.5 [1.0, 2.0], success 50% [9%, 91%] at the end")
     assert line.endswith("(2 episodes)")
+
+
+def test_success_rates_that_are_equal_are_said_once() -> None:
+    line = describe(summarize(episodes()[1:]))
+    assert line == "return 1.0 [1.0, 1.0], success 0% [0%, 79%] at the end (1 episode)"

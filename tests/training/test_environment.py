@@ -11,8 +11,15 @@ from merl.core import MerlError
 from merl.envs.config import EnvConfig
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
+from merl.training.plain import from_plain, to_plain
 
 WARP = EnvConfig(renderer="warp", image_size=32)
+
+
+def test_recorded_config_names_the_renderer_that_draws() -> None:
+    plain = to_plain(TrainConfig("reach_duplo", env=EnvConfig()))["env"]
+    assert plain["renderer"] == "warp"
+    assert from_plain(EnvConfig, plain | {"renderer": "auto"}).renderer == "warp"
 
 
 @pytest.mark.parametrize(

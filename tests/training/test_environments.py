@@ -175,7 +175,8 @@ def test_a_worker_that_is_lost_is_started_again(
     # On a busy machine one that only is slow must not seem to hang.
     flags = ["--num-envs", "2", "--worker-timeout", "600" if how == "dies" else "5"]
     assert train(tmp_path / "run", how, *flags) == 0
-    assert "starting the environments again (1 of 10 times)" in flat(capfd.readouterr().out)
+    said = flat(capfd.readouterr().out)
+    assert "starting the environments again (restart 1 of 10)" in said
     metrics = read_metrics(tmp_path / "run")
     assert np.nanmax(metrics["workers/restarts"]) == 1
     assert np.nanmax(metrics["train/length"]) == 10  # the episode that was cut is not counted
@@ -189,7 +190,7 @@ def test_workers_that_are_lost_too_often_end_the_run_with_a_checkpoint(
     run = tmp_path / "run"
     assert train(run, "dies", "--no-synchronous", "--worker-restarts", "1") == 4
     said = flat(capfd.readouterr().err)
-    assert "an environment's process died, after 1 restarts: the run is saved at step 48" in said
+    assert "an environment's process died, after 1 restart: the run is saved at step 48" in said
     assert Checkpoint.find(Run.open(run).checkpoints).step == 48
     assert cli.main(["resume", str(run)]) == 0
     assert Checkpoint.find(Run.open(run).checkpoints).step == 100

@@ -17,11 +17,11 @@ from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
 from merl.report.references import references
+from merl.resources import allow_picture_threads
 from merl.training.console import describe
 from merl.training.evaluation import EVALUATION_SEED, load_policy
 from merl.training.evaluation import evaluate as evaluate_policy
 from merl.training.run import Run
-from merl.training.timing import use_threads
 from merl.training.video import MIN_SIDE
 
 
@@ -67,8 +67,8 @@ def evaluate(args: list[str]) -> int:
     check_writable(file)
     console = make_console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
-    # As the run had it: several threads wait for each other where the machine does other work, too.
-    use_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))
+    # Actions take one thread (`load_policy`), pictures as many as in training.
+    allow_picture_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))
     changes: dict[str, Any] = {} if options.renderer is None else {"renderer": options.renderer}
     if options.video is not None:
         size = max(policy.config.env.render_size, MIN_SIDE)

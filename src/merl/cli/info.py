@@ -11,7 +11,7 @@ import merl
 from merl.bench.renderers import renderer_speeds
 from merl.cli.output import make_console
 from merl.cli.parsing import parse
-from merl.core import MerlError
+from merl.core import MerlError, counted
 from merl.experiments.presets import compose
 from merl.resources import available_memory, free_disk
 from merl.training.machine import machine, package_versions
@@ -42,7 +42,7 @@ def _rows() -> Iterator[tuple[str, str]]:
     yield "merl", merl.__version__
     yield from package_versions().items()
     here = machine()
-    yield "processor", f"{here['processor']}, {here['cores']} cores"
+    yield "processor", f"{here['processor']}, {counted(here['cores'], 'core')}"
     yield "features", ", ".join(processor_features()) or "none of note"
     yield "GPU", here["gpu"] or "none that torch finds"
     yield "memory", f"{available_memory() / 1e9:.1f} GB available to this process"

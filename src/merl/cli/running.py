@@ -6,14 +6,14 @@ import dataclasses
 import sys
 from collections.abc import Collection
 from contextlib import ExitStack
-from datetime import timedelta
 from pathlib import Path
 
 from rich.filesize import decimal
 
+from merl.cli.duration import DurationView, duration
 from merl.cli.output import make_console
 from merl.cli.summary import summarize
-from merl.core import MerlError, NotSaved, is_image
+from merl.core import MerlError, NotSaved, counted, is_image
 from merl.replay import replay_bytes
 from merl.report.references import EXPERT, RANDOM, references
 from merl.training import trainer
@@ -26,6 +26,8 @@ from merl.training.resuming import REOPENED, left_open, reopened, taken_up
 from merl.training.run import Run
 from merl.training.run_folder import check_links, resume_line
 from merl.training.stretch import Outcome
+
+DAY = 86_400.0  # seconds
 
 
 def begin(config: TrainConfig, what: str) -> int:
@@ -84,7 +86,7 @@ def go_on(
             raise MerlError(f"--steps {config.steps} is less than the {start.step:,} already taken")
         evaluated = not config.eval.every or state["progress"]["evaluated"] == start.step
         if start.step >= config.steps and evaluated:
-            steps = f"{start.step:,} of {config.steps:,} steps"
+            steps = f"{start.step:,} of {counted(config.steps, 'step')}"
             print(f"{run.path} is done: {steps}; --steps N takes it further")
             return 0
         if not run.replay.is_dir():
@@ -116,7 +118,13 @@ def _train(
                 resumed[0].check_environment(parts.space, parts.action_space, own_bounds(parts.env))
             done = resumed[1].step if resumed and resumed[1] else 0
             console.print(_outlook(parts, what, done), highlight=False)
-            with ConsoleView(console, _scale(config)) as view:
+            scale = _scale(config)
+            view = (
+                ConsoleView(console, scale)
+                if parts.timing.knows_env
+                else DurationView(console, parts, scale)
+            )
+            with view:
                 if resumed:
                     outcome = trainer.resume(parts, *resumed, view)
                 else:
@@ -148,7 +156,7 @@ def check_saved(outcome: Outcome) -> None:
     """
     run, rows = outcome.run, outcome.unwritten
     lost = [] if outcome.saved else ["its checkpoint"]
-    lost += [f"{rows} rows of its metrics"] if rows else []
+    lost += [f"{counted(rows, 'row')} of its metrics"] if rows else []
     if not lost:
         return
     try:
@@ -171,37 +179,28 @@ def _scale(config: TrainConfig) -> dict[str, float]:
 
 
 def _outlook(parts: Parts, what: str, done: int) -> str:
-    """What is going to happen, and how long it will take on this machine."""
+    """Return what is going to happen, and how long it will take on this machine."""
     config, timing = parts.config, parts.timing
-    seconds = timing.seconds(config, done)
     size = replay_bytes(
         config.replay, parts.space, parts.action_space, config.capacity, config.num_envs
     )
     tried = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
     seen = not config.own_env and any(is_image(space) for space in parts.space.values())
     pictures = f" ({config.env.renderer} pictures)" if seen else ""
-    lines = [
-        f"{what}: {_amount(config, done)} of {config.task} on {config.device} take about "
-        f"{timedelta(seconds=round(seconds))}",
-    ]
-    if seconds > 86_400 and config.preset != "laptop":
+    lines = [f"{what}: {duration(config, timing, done)}"]
+    if timing.seconds(config, done) > DAY and config.preset != "laptop":
         lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
     lines += key_lines(config, parts.env)
+    step = "a step" if timing.knows_env else "a step, without the environment's part"
     lines += [
-        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms a step{pictures}",
-        f"the replay takes {decimal(size)} for {config.capacity:,} steps",
+        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms {step}{pictures}",
+        f"the replay takes {decimal(size)} for {counted(config.capacity, 'step')}",
     ]
     if timing.not_compiled is not None:
         lines.append(f"updates are not compiled, which fails here: {timing.not_compiled}")
     if (config.steps - config.seed_steps) * config.updates_per_step < 1:
         lines.append(
-            f"nothing will be learnt: the first update comes after {config.seed_steps:,} steps, "
-            "with --updates-per-step above 0"
+            "nothing will be learnt: the first update comes after "
+            f"{counted(config.seed_steps, 'step')}, with --updates-per-step above 0"
         )
     return "\n".join(lines)
-
-
-def _amount(config: TrainConfig, done: int) -> str:
-    """How much there is to do."""
-    steps = f"{config.steps - done:,} steps"
-    return steps if config.minutes is None else f"{config.minutes:g} minutes, or {steps},"

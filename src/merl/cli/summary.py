@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from merl.core import MerlError
+from merl.core import MerlError, counted
 from merl.envs.adapted import in_one_line
 from merl.report.references import RANDOM, Reference, references
 from merl.training.config import TrainConfig
@@ -85,7 +85,7 @@ def floors(
     finally:
         env.close()
     return tuple(
-        Reference(name, result.returns, result.success_end, f"{episodes} episodes")
+        Reference(name, result.returns, result.success_end, counted(episodes, "episode"))
         for name, result in zip(FLOORS, results, strict=True)
     )
 
@@ -93,7 +93,7 @@ def floors(
 def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> Table:
     """What was trained among its references."""
     table = Table("", "return", "success at the end", "from", title=task)
-    episodes = f"{len(trained.episodes)} episodes"
+    episodes = counted(len(trained.episodes), "episode")
     rows = [*beside, Reference("trained", trained.returns, trained.success_end, episodes)]
     for row in rows:
         returns = f"{row.returns.mean:.1f}"
@@ -132,7 +132,10 @@ def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> 
         return "Nothing was learnt: there was no update."
     lower = [row for row in beside if row.name in FLOORS]
     if not lower:
-        return "Whether it has learnt cannot be said: there is nothing to compare with."
+        return (
+            "Whether it has learnt cannot be said: there is nothing to compare with "
+            "(--eval.references takes 20 episodes each of random actions and of no motion)."
+        )
     floor = max(lower, key=lambda row: row.returns.high)
     if trained.returns.low <= floor.returns.high:
         return (
@@ -140,9 +143,10 @@ def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> 
             f"{floor.name}."
         )
     if len(trained.episodes) < ENOUGH:
+        episodes = counted(len(trained.episodes), "episode")
         return (
-            f"Its return lies above that of {floor.name}, but {len(trained.episodes)} episodes are "
-            "too few to say that it has learnt: evaluate more (--eval.episodes)."
+            f"Its return lies above that of {floor.name}, but {episodes} cannot show that it has "
+            "learnt: evaluate more (--eval.episodes)."
         )
     return f"It has begun to learn: its return lies clearly above that of {floor.name}."
 

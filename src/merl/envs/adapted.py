@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from merl.core import EnvironmentFailed, MerlError, NotFinite
+from merl.core import EnvironmentFailed, MerlError, NotFinite, counted
 from merl.envs.config import UserEnvConfig
 from merl.envs.user_spaces import Modality, action_bounds, advice, brief, modality
 from merl.envs.user_values import shown, to_bool, to_info, to_number
@@ -223,7 +223,7 @@ def _is_users(filename: str) -> bool:
 def _apart(what: str, given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
     """The tuple that a call returned, checked for its length."""
     if not isinstance(given, tuple) or len(given) != len(names):
-        many = f"{len(given)} values" if isinstance(given, tuple) else type(given).__name__
+        many = counted(len(given), "value") if isinstance(given, tuple) else type(given).__name__
         raise EnvironmentFailed(
             f"the environment's {what} gave {many}: it must return {', '.join(names)}"
         )

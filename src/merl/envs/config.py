@@ -8,6 +8,11 @@ from typing import Literal, get_args
 from merl.core import MerlError, check_choice
 
 RendererName = Literal["gl", "warp"]
+RendererChoice = Literal["auto", "gl", "warp"]
+AUTO_RENDERER: RendererName = "warp"
+"""The renderer that `auto` stands for: the only one that works on every machine, and the faster one
+where both were measured (docs/bench.md). It does not depend on the machine, so the same code sees
+the same pictures everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
@@ -22,9 +27,10 @@ SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 class EnvConfig:
     """How an environment is seen."""
 
-    renderer: RendererName = "gl"
+    renderer: RendererChoice = "auto"
     """What draws the pictures: `gl` (OpenGL, as dm_control does) or `warp` (a ray tracer that
-    needs no OpenGL and is much faster on a CPU; its pictures look slightly different)."""
+    needs no OpenGL and is much faster on a CPU; its pictures look slightly different). `auto` is
+    replaced by `warp`, which works everywhere."""
 
     image_size: int = 84
     """Height and width of the agent's picture, in pixels; from 16 to 2048."""
@@ -63,7 +69,9 @@ class EnvConfig:
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
 
     def __post_init__(self) -> None:
-        check_choice("renderer", self.renderer, get_args(RendererName))
+        check_choice("renderer", self.renderer, get_args(RendererChoice))
+        if self.renderer == "auto":  # a config, and so a run's record, names what really draws
+            object.__setattr__(self, "renderer", AUTO_RENDERER)
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
         check_choice("reward", self.reward, get_args(RewardName))

@@ -19,10 +19,13 @@ from gymnasium.envs.registration import registry
 from merl.core import MerlError, meant
 from merl.envs.adapted import adapt, failing, in_one_line
 from merl.envs.config import UserEnvConfig
+from merl.envs.packages import installing
 from merl.envs.registration import ENV_IDS
 
 BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that come with merl."""
+CLOSE = 0.8
+"""How similar an unknown id must be to a known one to be a mistyped form of it."""
 
 
 def make_own(
@@ -102,10 +105,9 @@ def load_module(task: str, *folders: Path) -> ModuleType:
                 f"task {task!r}: {module!r} imports {error.name!r}, which is not installed here"
             ) from None
         places = " or ".join([*map(str, folders), "what is installed"])
-        raise MerlError(
-            f"task {task!r}: {error} in {places}: name its folder in PYTHONPATH, or call `merl "
-            "train` where it lies"
-        ) from None
+        way = installing(task.partition(":")[2], module)
+        way = way or "name its folder in PYTHONPATH, or call `merl train` where it lies"
+        raise MerlError(f"task {task!r}: {error} in {places}: {way}") from None
     except Exception as error:
         raise MerlError(
             f"task {task!r}: importing {module!r} failed: {in_one_line(error)}"
@@ -158,8 +160,8 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
         raise MerlError(f"task {task!r} is merl's own: call it {known}")
     if not colon:
         if task not in registry:
-            way = meant(task, [*ENV_IDS, *registry])
-            if not way.startswith("did"):
+            way = installing(task) or meant(task, [*ENV_IDS, *registry], CLOSE)
+            if not way.startswith(("did", "it comes")):
                 way = f"choose from {', '.join(ENV_IDS)}, or name a Gymnasium id or module:function"
             raise MerlError(f"task {task!r} is unknown: {way}")
         return _by_id(task, render_mode)
@@ -168,9 +170,10 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
     if make is None:
         if name in registry:
             return _by_id(name, render_mode)
+        way = meant(name, registry, CLOSE)
         raise MerlError(
             f"task {task!r}: module {module!r} has no function {name!r}, and registers no "
-            "environment of that name"
+            f"environment of that name{f': {way}' if way.startswith('did') else ''}"
         )
     env = _called(task, make, render_mode)
     if not isinstance(env, gymnasium.Env):

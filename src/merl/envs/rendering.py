@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.envs.config import RendererName
+from merl.envs.config import RendererChoice
 from merl.envs.opengl import GlRenderer, enable_opengl
 from merl.envs.ray_tracing import WarpRenderer
 
@@ -31,11 +31,11 @@ class Renderer(Protocol):
         ...
 
 
-def make_renderer(name: RendererName, physics: Any, camera: str, size: int) -> Renderer:
-    """A renderer by its name.
+def make_renderer(name: RendererChoice, physics: Any, camera: str, size: int) -> Renderer:
+    """Make a renderer by its name.
 
     Args:
-        name: `gl` or `warp`.
+        name: `gl` or `warp`; `EnvConfig` has replaced `auto`.
         physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
         camera: the name of a camera in the model.
         size: height and width of the pictures, in pixels.
@@ -43,11 +43,11 @@ def make_renderer(name: RendererName, physics: Any, camera: str, size: int) -> R
     Raises:
         MerlError: `gl`, and no OpenGL library works.
     """
-    renderers: dict[RendererName, type[Renderer]] = {"gl": GlRenderer, "warp": WarpRenderer}
+    renderers: dict[str, type[Renderer]] = {"gl": GlRenderer, "warp": WarpRenderer}
     return renderers[name](physics, camera, size)
 
 
-def check_renderer(name: RendererName) -> None:
+def check_renderer(name: RendererChoice) -> None:
     """Make sure that a renderer works here, before anything is built on it.
 
     Raises:

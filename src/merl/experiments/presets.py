@@ -39,7 +39,7 @@ class Preset:
 PRESETS: dict[str, Preset] = {
     "paper": Preset(
         "Table 1, OpenGL pictures: for a machine with CUDA",
-        TrainConfig(_TASK),
+        TrainConfig(_TASK, env=EnvConfig(renderer="gl")),
     ),
     "laptop": Preset(
         "made for 2 cores without a GPU: learns in about an hour",  # docs/laptop.md
@@ -160,6 +160,9 @@ def compose(
     check_choice("agent", name, tuple(AGENTS))
     check_choice("setting", setting, get_args(Setting))
     config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
+    if not config.own_env:  # a user's environment may be a robot, which nothing moves unasked
+        evaluation = dataclasses.replace(config.eval, references=True)
+        config = dataclasses.replace(config, eval=evaluation)
     values = dict(chosen.agent)
     base = AGENTS[name]
     if preset == "paper" and base.head_norm:

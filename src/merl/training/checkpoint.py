@@ -28,6 +28,7 @@ from safetensors.torch import save as to_bytes
 from torch import nn
 
 from merl.core import Agent, MerlError
+from merl.networks.settings import torch_settings
 from merl.training.guards import check_weights
 
 FORMAT = 1
@@ -38,6 +39,7 @@ _WEIGHTS, _LEARNER, _STATE, _MANIFEST = (
     "manifest.json",
 )
 _WEIGHT_GROUPS = ("networks", "critic_target")
+_CPU = torch.device("cpu")
 _LOG = logging.getLogger(__name__)
 
 
@@ -135,14 +137,16 @@ def save(
         OSError: it could not be written; the former ones are untouched.
         NotFinite: a weight is a NaN or an infinity; so are they then.
     """
-    learnt = agent.state_dict()
-    check_weights({group: learnt[group] for group in _WEIGHT_GROUPS})
+    with torch_settings(_CPU):
+        learnt = agent.state_dict()
+        check_weights({group: learnt[group] for group in _WEIGHT_GROUPS})
     root.mkdir(exist_ok=True)  # no parents: a run's folder that was taken away stays away
     part = root / f".part-{step:08d}"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
-        _write(part, learnt, state)
+        with torch_settings(_CPU):
+            _write(part, learnt, state)
         names = (_WEIGHTS, _LEARNER, _STATE)
         manifest = {
             "format": FORMAT,
@@ -177,7 +181,7 @@ def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
     Raises:
         MerlError: a file cannot be read, or belongs to other networks.
     """
-    with _readable(checkpoint):
+    with _readable(checkpoint), torch_settings(_CPU):
         learner = _learner(checkpoint)
         agent.load_state_dict({**_weights(checkpoint), **learner})
 
@@ -188,7 +192,7 @@ def load_networks(networks: nn.Module, checkpoint: Checkpoint) -> None:
     Raises:
         MerlError: a file cannot be read, or belongs to other networks.
     """
-    with _readable(checkpoint):
+    with _readable(checkpoint), torch_settings(_CPU):
         networks.load_state_dict(_weights(checkpoint)["networks"])
 
 

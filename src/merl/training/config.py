@@ -11,7 +11,7 @@ import tyro
 
 from merl.agents import AGENTS
 from merl.agents.config import AgentConfig
-from merl.core import MerlError, check_choice
+from merl.core import MerlError, check_choice, counted
 from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
@@ -37,9 +37,10 @@ class EvaluationConfig:
     """Steps after which an episode of an evaluation is cut, if it has not ended by itself."""
     video: Literal["each", "last", "none"] = "each"
     """Which evaluations to film (their first episode)."""
-    references: bool = True
-    """At the end, and where it is not known, take 20 episodes each of random actions and of none to
-    compare with; not with an arm that must not flail (--eval.no-references)."""
+    references: bool = False
+    """At the end, take 20 episodes each of random actions and of none to compare with, where merl
+    does not know their returns. Set for merl's own tasks; on an environment of your own it moves
+    your robot at random."""
 
     def __post_init__(self) -> None:
         for name, least in (("every", 0), ("episodes", 1), ("max_episode_steps", 1)):
@@ -75,6 +76,9 @@ class TrainConfig:
     """The seed of everything random in the run."""
     steps: int = 1_000_000
     """Environment steps."""
+    measure: bool = False
+    """Time an environment of your own before the run begins, as merl's own tasks are, with 75
+    random steps; if not set, the first steps of the run are timed."""
     minutes: float | None = None
     """Stop after this many minutes (since start or resume), if the steps are not done before."""
     run_dir: Path | None = None
@@ -107,7 +111,9 @@ class TrainConfig:
     longer."""
     keep: int = 2
     """How many of the last checkpoints are kept, beside the best."""
-    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
+    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: EnvConfig(renderer="gl")
+    )
     user_env: Annotated[UserEnvConfig, tyro.conf.arg(name="env")] = field(
         default_factory=UserEnvConfig
     )
@@ -148,9 +154,9 @@ class TrainConfig:
                 raise MerlError(f"{flag} must be finite and at least 0, not {getattr(self, name)}")
         if self.replay.batch_size > self.capacity:
             raise MerlError(
-                f"replay.batch-size {self.replay.batch_size} is more than the {self.capacity} "
-                "steps of the run, which is all that the replay will hold: use a smaller batch or "
-                "more steps"
+                f"replay.batch-size {self.replay.batch_size} is more than the "
+                f"{counted(self.capacity, 'step')} of the run, which is all that the replay will "
+                "hold: use a smaller batch or more steps"
             )
 
     @property

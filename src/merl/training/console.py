@@ -16,7 +16,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from merl.core import METRICS_FILE
+from merl.core import METRICS_FILE, counted
 from merl.training.evaluation import Evaluation
 from merl.training.loop import Moment
 from merl.training.run import Run
@@ -258,9 +258,10 @@ def describe(evaluation: Evaluation) -> str:
     returns, end = evaluation.returns, evaluation.success_end
     line = f"return {returns.mean:.1f} [{returns.low:.1f}, {returns.high:.1f}]"
     if end is not None and evaluation.success_any and evaluation.success_share:
-        line += (
-            f", success {end.mean:.0%} [{end.low:.0%}, {end.high:.0%}] at the end, "
-            f"{evaluation.success_any.mean:.0%} at any time, "
-            f"{evaluation.success_share.mean:.0%} of the steps"
-        )
-    return f"{line} ({len(evaluation.episodes)} episodes)"
+        line += f", success {end.mean:.0%} [{end.low:.0%}, {end.high:.0%}] at the end"
+        if not end.mean == evaluation.success_any.mean == evaluation.success_share.mean:
+            line += (
+                f", {evaluation.success_any.mean:.0%} at any time, "
+                f"{evaluation.success_share.mean:.0%} of the steps"
+            )
+    return f"{line} ({counted(len(evaluation.episodes), 'episode')})"

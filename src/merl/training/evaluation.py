@@ -99,13 +99,16 @@ class Policy:
             trust: import the environment that the run names, although you have not trained this
                 run on this machine: that runs the code of whoever made the run. Not needed for
                 merl's own tasks and Gymnasium's.
-            **changes: fields of `EnvConfig`, and `render_mode`.
+            **changes: fields of `EnvConfig`, and `render_mode`; the renderer `auto` is that of the
+                training.
 
         Raises:
             MerlError: it is not trusted, cannot be made, or is no longer what the agent was
                 trained in.
         """
         renderer = changes.get("renderer", self.config.env.renderer)
+        if renderer == "auto" and not self.config.own_env:
+            renderer = changes["renderer"] = self.config.env.renderer
         if renderer != self.config.env.renderer and not self.config.own_env:
             warnings.warn(
                 f"the agent was trained with renderer {self.config.env.renderer!r} and sees "
@@ -297,16 +300,23 @@ def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
     return Modality(key, space, space)
 
 
-def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:
-    """The policy that a run has learnt; no code of the run is imported or executed.
+def load_policy(
+    run: str | Path, *, checkpoint: str | int = "latest", threads: int | None = 1
+) -> Policy:
+    """Load the policy that a run has learnt; no code of the run is imported or executed.
 
     Args:
         run: the run's folder.
         checkpoint: "latest", "best" (by evaluation return), or a checkpoint's number of steps.
+        threads: processor threads that compute an action; None takes torch's own setting. For one
+            observation, several threads mostly wait for each other. Torch's setting for the rest
+            of the program is restored after each action.
 
     Raises:
         MerlError: there is no run, or no whole checkpoint in it.
     """
+    if threads is not None and (type(threads) is not int or threads < 1):
+        raise MerlError(f"threads is {threads!r}: give a whole number, at least 1, or None")
     opened = Run.open(Path(run))
     saved = Checkpoint.find(opened.checkpoints, str(checkpoint))
     config, device = opened.config, torch.device("cpu")
@@ -320,6 +330,7 @@ def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:
         frame_stack=config.replay.frame_stack,
         seed=0,
         device=device,
+        threads=threads,
     )
     load_networks(agent.networks, saved)
     return Policy(

@@ -17,7 +17,7 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
-from merl.core import MerlError
+from merl.core import MerlError, counted
 from merl.envs.own import load_module
 from merl.replay import check_fits
 from merl.resources import available_memory, keep_freed_memory
@@ -84,6 +84,7 @@ class Parts:
             frame_stack=config.replay.frame_stack,
             seed=self.randomness.agent,
             device=self.device,
+            threads=best.threads,
         )
 
     @classmethod
@@ -103,7 +104,8 @@ class Parts:
         processors = os.cpu_count() or 1
         if config.threads is not None and config.threads > processors:
             raise MerlError(
-                f"threads is {config.threads}, but this machine has {processors} processors: "
+                f"threads is {config.threads}, but this machine has "
+                f"{counted(processors, 'processor')}: "
                 f"give at most {processors}"
             )
         home = Path.cwd()  # before any user code runs, which may change it
@@ -127,7 +129,9 @@ class Parts:
             eval_env = None
             if config.eval.every:
                 size = max(config.env.render_size, MIN_SIDE)
-                eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)
+                # Whether a user's environment renders takes a reset to find out.
+                mode = None if config.own_env and config.eval.video == "none" else "rgb_array"
+                eval_env = make_run_env(config, render_mode=mode, render_size=size)
                 stack.callback(eval_env.close)
                 expected = EnvSpaces.of(config, env)
                 expected.check(EnvSpaces.of(config, eval_env), "the one that is evaluated in")

@@ -11,6 +11,7 @@ from merl.training.config import TrainConfig
 
 HARMLESS = (
     "steps",
+    "measure",
     "minutes",
     "worker_restarts",
     "worker_timeout",

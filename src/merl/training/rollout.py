@@ -79,7 +79,9 @@ class Fetched:
         self.under_way = tensor.is_cuda
         self._there = tensor
         if self.under_way:
-            self._there = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+            self._there = torch.empty(
+                tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=True
+            )
             self._there.copy_(tensor, non_blocking=True)
             self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self._done.record()

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, is_image
+from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, counted, is_image
 from merl.replay import Lanes
 from merl.training import checkpoint
 from merl.training.acting import Environments, Lost
@@ -243,12 +243,12 @@ class Stretch:
             step = self.parts.progress.step
             saved = f"the run is saved at step {step:,}; go on with `{resume_line(self.run.path)}`"
             raise EnvironmentsLost(
-                f"an environment's process {what}, after {most} restarts: "
+                f"an environment's process {what}, after {counted(most, 'restart')}: "
                 + (saved if step else "the run ends before its first step")
             )
         self.view.warn(
-            f"an environment's process {what}: starting the environments again ({self.losses} of "
-            f"{most} times)"
+            f"an environment's process {what}: starting the environments again (restart "
+            f"{self.losses} of {most})"
         )
 
     def _is_to_stop(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from contextlib import ExitStack
 
+from merl.networks.settings import torch_settings
 from merl.replay import Lanes
 from merl.training.acting import Here, Workers
 from merl.training.checkpoint import Checkpoint
@@ -42,14 +43,15 @@ def _train(parts: Parts, run: Run, point: Checkpoint | None, view: View) -> Outc
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt().listening())
         metrics = stack.enter_context(MetricsWriter(run.path, view.warn))
-        replay = Lanes(
-            config.replay,
-            parts.space,
-            parts.action_space,
-            count=config.num_envs,
-            directory=run.replay,
-            capacity=config.capacity,
-        )
+        with torch_settings(parts.device):
+            replay = Lanes(
+                config.replay,
+                parts.space,
+                parts.action_space,
+                count=config.num_envs,
+                directory=run.replay,
+                capacity=config.capacity,
+            )
         with interrupt.raising():
             environments = Workers(config, parts.env) if config.has_workers else Here(parts.env)
         stack.callback(environments.close)

@@ -19,9 +19,11 @@ import merl
 from merl.agents import AGENTS
 from merl.cli import main
 from merl.core import EnvironmentFailed, MerlError
+from merl.envs.adapted import adapt
 from merl.envs.config import UserEnvConfig
 from merl.experiments.presets import compose
 from merl.report.curves import read_metrics
+from merl.training.acting import _Maker
 from merl.training.config import TrainConfig
 from merl.training.environment import EnvSpaces, key_lines, make_run_env, run_spaces
 from merl.training.evaluation import evaluate
@@ -250,8 +252,6 @@ def still(_: Any) -> Any:
 
 
 def test_success_told_by_the_successful_alone_is_a_share_of_all_episodes() -> None:
-    from merl.envs.own import adapt
-
     result = evaluate(still, adapt(Toy(reported_by_those_that_succeed)), 20)
     for interval in (result.success_end, result.success_any, result.success_share):
         assert interval is not None
@@ -297,8 +297,6 @@ def test_once_success_is_reported_silence_is_failure_also_after_resuming(
 
 
 def test_a_success_that_is_neither_ends_the_run_in_one_line() -> None:
-    from merl.envs.own import adapt
-
     env = adapt(Toy(lambda episode, step: {"is_success": {"other": True}}))
     with pytest.raises(EnvironmentFailed, match=r"info\[\"is_success\"\] is \{'other': True\}"):
         evaluate(still, env, 1)
@@ -356,8 +354,6 @@ def test_instances_that_differ_are_refused_at_the_start(
 
 
 def test_a_worker_compares_its_instance_with_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    from merl.training.acting import _Maker
-
     monkeypatch.setattr(Changing, "change", "bounds")
     monkeypatch.setattr(Changing, "instances", itertools.count())
     config = compose("smoke", f"{here}:Changing")

@@ -10,7 +10,7 @@ import pytest
 
 from merl.cli import COMMANDS, main
 from merl.training.config import TrainConfig
-from merl.training.run import run_path
+from merl.training.run_folder import run_path
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -119,6 +119,21 @@ def test_what_others_have_put_into_a_folder_stays(tmp_path: Path) -> None:
     assert list((tmp_path / "mine").iterdir()) == []
 
 
+@pytest.mark.usefixtures("_quick")
+@pytest.mark.parametrize("name", ["commit", "trust.remember"])
+def test_a_start_that_is_interrupted_leaves_nothing(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"merl.training.run.{name}", interrupt)
+    config = dataclasses.replace(CONFIG, run_dir=tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt), Run.begin(config, *SPACES):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("left", [(), (LOCK_FILE,), (LOCK_FILE, ".config.json.part")])
 @pytest.mark.parametrize("resume", [["--resume"], []])
 def test_a_run_that_was_killed_at_its_very_start_is_begun_by_the_same_line(

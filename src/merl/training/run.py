@@ -17,7 +17,7 @@ import os
 import shlex
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,30 +96,37 @@ class Run:
         """
         path, created = create_folder(config, home)
         run = cls(path, config, left_open, created)
-        with run.lock():
-            refuse_existing(path)  # by the process that had the lock before
-            record = {
-                "format": FORMAT,
-                "id": trust.identity(),
-                "merl": merl.__version__,
-                "task": config.task,
-                "agent": config.agent_name,
-                "preset": config.preset,
-                "setting": config.setting,
-                "seed": config.seed,
-                "config": to_plain(config),
-                "left_open": list(left_open),
-                "module_folder": _module_folder(config.task),
-                "observation_space": {key: describe(s) for key, s in observation_space.items()},
-                "action_space": describe(action_space) | {"own_bounds": bounds},
-                "versions": package_versions(),
-                "commit": commit(),
-                "machine": machine(),
-            }
+        with ExitStack() as stack:
             try:
+                stack.enter_context(run.lock())
+            except BaseException:
+                with suppress(OSError):  # another process has locked it
+                    if created:
+                        path.rmdir()
+                raise
+            refuse_existing(path)  # by the process that had the lock before
+            try:
+                record = {
+                    "format": FORMAT,
+                    "id": trust.identity(),
+                    "merl": merl.__version__,
+                    "task": config.task,
+                    "agent": config.agent_name,
+                    "preset": config.preset,
+                    "setting": config.setting,
+                    "seed": config.seed,
+                    "config": to_plain(config),
+                    "left_open": list(left_open),
+                    "module_folder": _module_folder(config.task),
+                    "observation_space": {k: describe(s) for k, s in observation_space.items()},
+                    "action_space": describe(action_space) | {"own_bounds": bounds},
+                    "versions": package_versions(),
+                    "commit": commit(),
+                    "machine": machine(),
+                }
                 run._write(record)
                 trust.remember(record)
-            except MerlError:
+            except BaseException:
                 run.discard()
                 raise
             yield run

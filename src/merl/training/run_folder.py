@@ -163,7 +163,7 @@ def lock_folder(run: Path) -> Iterator[None]:
         except OSError as error:
             raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
         if not same:
-            raise MerlError(f"run folder {run} was removed by another process just now")
+            raise MerlError(f"run folder {run} was removed by another process just now: try again")
         with suppress(OSError):  # a full disk; the lock holds without the number
             file.truncate(0)
             os.write(file.fileno(), str(os.getpid()).encode())

@@ -57,9 +57,9 @@ class EvaluateOptions:
 def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
     options = parse(EvaluateOptions, "merl evaluate", args)
+    check_writable(options.json)
     # Absolute before any user code runs, which may change the working folder.
     file, film = _absolute(options.json), _absolute(options.video)
-    check_writable(file)
     console = Console(markup=False)
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     # As the run had it: several threads wait for each other where the machine does other work, too.

@@ -368,3 +368,20 @@ def test_an_episode_without_end_is_saved_and_warned_of(
     assert main(["resume", "run", "--steps", str(more)]) == 0
     assert saved()[-1] == more
     assert "stopped in an episode" in " ".join(capsys.readouterr().out.split())
+
+
+def test_evaluations_that_start_otherwise_each_time_are_warned_of(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As with statistics that are taken in `step`: two resets at the start do not show them."""
+
+    def drift(env: Any, seen: Any) -> Any:
+        env.drift = getattr(env, "drift", 0.0) + 1.0
+        return seen
+
+    unruly.in_evaluation = drift
+    unruly.draw = lambda env: env.np_random.normal() + getattr(env, "drift", 0.0)
+    assert train() == 0
+    said = capsys.readouterr()
+    assert " ".join(said.out.split()).count("do not start as those of the one before") == 1
+    assert said.err == ""

@@ -62,9 +62,9 @@ class EvaluateOptions:
 def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
     options = parse(EvaluateOptions, "merl evaluate", args)
+    check_writable(options.json)
     # Absolute before any user code runs, which may change the working folder.
     file, film = _absolute(options.json), _absolute(options.video)
-    check_writable(file)
     console = make_console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     # Actions take one thread (`load_policy`), pictures as many as in training.

@@ -51,7 +51,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
     if trained is not None:
         console.print(_verdict(beside, trained, outcome.progress.updates), highlight=False)
-    else:
+    elif outcome.saved:
         console.print(
             f"{run.path} is trained and saved, and not evaluated", highlight=False, soft_wrap=True
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from merl.core import EvaluationFailed, MerlError
 from merl.envs.adapted import in_one_line
 from merl.training.evaluation import Evaluation, Policy, evaluate
+from merl.training.meters import Clock
 from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
 from merl.training.run import Run
@@ -34,8 +35,6 @@ class Evaluations:
         metrics: receives the numbers.
         view: shows them.
         interrupt: ends an evaluation at once.
-        save: writes a checkpoint; returns whether it is on the disk.
-        seconds: the time of training so far.
 
     Attributes:
         last: the last evaluation; None before the first.
@@ -48,12 +47,9 @@ class Evaluations:
         metrics: MetricsWriter,
         view: View,
         interrupt: Interrupt,
-        save: Callable[[], bool],
-        seconds: Callable[[], float],
     ) -> None:
         self._parts, self._config, self._run = parts, parts.config, run
         self._metrics, self._view, self._interrupt = metrics, view, interrupt
-        self._save, self._seconds = save, seconds
         self.last: Evaluation | None = None
         self._warned = set[str]()
 
@@ -64,8 +60,13 @@ class Evaluations:
             return False
         return progress.step // every > progress.evaluated // every
 
-    def run(self, last: bool = False) -> None:
+    def run(self, save: Callable[[], bool], clock: Clock, *, last: bool = False) -> None:
         """Evaluate, after a save: whatever the evaluation does, no training is lost.
+
+        Args:
+            save: writes a checkpoint; returns whether it is on the disk.
+            clock: tells the time of the run.
+            last: no more training follows.
 
         Raises:
             EvaluationFailed: it ended by an exception. The resumed run repeats it, and from then on
@@ -76,20 +77,20 @@ class Evaluations:
         if progress.attempts > ATTEMPTS:
             self._leave_out(f"was begun {ATTEMPTS} times and never finished")
             return
-        self._save()
+        save()
         try:
             self.last = self._measured(last)
         except Exception as error:
             if isinstance(error, _Interrupted) or self._interrupt.number is not None:
                 progress.attempts -= 1
                 return
-            self._fail(error)
+            self._fail(error, save)
             return
         self._run.check_there()
         progress.evaluated, progress.attempts = progress.step, 0
         progress.reports_success |= self.last.success_end is not None
         values = {f"eval/{name}": value for name, value in self.last.metrics().items()}
-        self._metrics.write(progress.step, values | {"time/seconds": self._seconds()})
+        self._metrics.write(progress.step, values | {"time/seconds": clock.seconds()})
         self._view.evaluated(progress.step, self.last)
         if before is not None and not self.last.starts_as(before):
             self._warn_once(
@@ -117,7 +118,7 @@ class Evaluations:
             reports_success=parts.progress.reports_success,
         )
 
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, error: Exception, save: Callable[[], bool]) -> None:
         """Handle an evaluation's exception: end the run, or leave the evaluation out.
 
         It is left out if it was begun before, or if the evaluation before it was left out: so a
@@ -130,7 +131,7 @@ class Evaluations:
             return
         line = resume_line(self._run.path)
         saved = f"the run is saved at that step: mend it, and go on with `{line}`"
-        if not self._save():
+        if not save():
             saved = f"go on from the last checkpoint with `{line}`"
         step = self._parts.progress.step
         failure = EvaluationFailed(f"the evaluation at step {step:,} failed: {why}; {saved}")

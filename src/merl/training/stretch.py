@@ -93,9 +93,7 @@ class Stretch:
         self.replay, self.environments = replay, environments
         self.metrics, self.view, self.interrupt = metrics, view, interrupt
         self.clock, self.averages, self.guard = Clock(), Averages(), LossGuard()
-        self.evaluations = Evaluations(
-            parts, run, metrics, view, interrupt, self._save, lambda: self.clock.seconds()
-        )
+        self.evaluations = Evaluations(parts, run, metrics, view, interrupt)
         self.losses = 0
         self._saved: dict[str, Any] | None = None  # the progress at the last save
         self._ended: int | None = None  # the last episode's step, until it is long ago
@@ -281,7 +279,7 @@ class Stretch:
         return values
 
     def _evaluate(self, last: bool = False) -> None:
-        self.evaluations.run(last)
+        self.evaluations.run(self._save, self.clock, last=last)
         self.clock.mark(self.parts.progress)  # evaluating is not counted against the speed
 
     def _environment_states(self) -> Sequence[Mapping[str, Any] | None]:

@@ -24,7 +24,7 @@ FALSE = (
 NEITHER = (
     None, np.nan, "False", "True", "", b"", 0.3, 2, -1, np.inf, [True, False], [], np.zeros(0),
     np.array("False"), {"other": True}, {}, {"task": None}, {"task": {"task": True}},
-    {"task": "False"}, {"task": np.nan}, object(), 1 + 0j, {True},
+    {"task": "False"}, {"task": np.nan}, ..., 1 + 0j, {True},
 )
 # fmt: on
 
@@ -103,7 +103,7 @@ class Unfriendly:
         None,
         [1.0, None],
         ["1", "2"],
-        object(),
+        ...,
         {"a": 1.0},
         [1j],
         np.array(["2020-01-01"], "datetime64[D]"),

@@ -1,11 +1,12 @@
 # make train: set up and train MERL on reach_duplo for about ten minutes.
 # make test: set up and pass the tests in their short form; make test-all runs the long forms too.
-# Both need nothing but Python 3.11 or 3.12, make and a package index.
+# Both need nothing but Python 3.11 or 3.12, make, bash and a package index.
 
 PYTHON := $(shell for p in python3.12 python3.11; do "$$p" --version >/dev/null 2>&1 && echo $$p && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
 MINUTES := 10
+PYTEST_FLAGS := --numprocesses 2 --dist worksteal --durations 10
 
 .PHONY: help setup train test test-all clean
 
@@ -16,9 +17,9 @@ setup: $(VENV)/ready
 
 $(VENV)/ready: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "merl needs python3.12 or python3.11 on the PATH, and finds neither: install one (Debian: apt-get install python3.11 python3.11-venv)" >&2; exit 2; }
-	@echo "setting up $(VENV) with $(PYTHON)"
+	@echo "setting up $(VENV) with $(PYTHON): a few minutes, most of them for torch"
 	@$(PYTHON) -m venv $(VENV) || { echo "$(PYTHON) cannot make a virtual environment: install its venv module (Debian: apt-get install $(PYTHON)-venv)" >&2; exit 2; }
-	@$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@bash install.sh $(BIN)/pip --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
 train: setup
@@ -29,14 +30,14 @@ test: setup
 	@$(BIN)/ruff format --check src tests
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
-	@$(BIN)/pytest -m "not long" --numprocesses 2 --dist loadfile
+	@$(BIN)/pytest -m "not long" $(PYTEST_FLAGS)
 
 test-all: setup
 	@$(BIN)/ruff check src tests
 	@$(BIN)/ruff format --check src tests
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
-	@$(BIN)/pytest --numprocesses 2 --dist loadfile
+	@$(BIN)/pytest $(PYTEST_FLAGS)
 
 clean:
 	rm -rf $(VENV)

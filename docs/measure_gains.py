@@ -79,8 +79,8 @@ def channels_first(agent: DDPG) -> Iterator[None]:
     agent.networks.encoders.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     as_input = augmentation.to_input
 
-    def contiguous(images: Tensor, dtype: torch.dtype) -> Tensor:
-        return as_input(images, dtype).contiguous()
+    def contiguous(images: Tensor, dtype: torch.dtype, middle: int) -> Tensor:
+        return as_input(images, dtype, middle).contiguous()
 
     with patch.object(encoders, "to_input", contiguous):
         yield

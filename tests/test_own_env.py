@@ -7,14 +7,17 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, ClassVar
 
 import av
 import numpy as np
 import pytest
 
 import merl
+from helpers import flat
 from merl.cli import main
 from merl.training.evaluation import EVALUATION_SEED
+from toy import DotEnv
 
 TWO_CAMERAS = '''
 import gymnasium
@@ -70,12 +73,13 @@ def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
 
     def call(*arguments: str, cwd: Path = tmp_path) -> str:
         command = [sys.executable, "-m", "merl.cli", *arguments]
-        done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         assert "Traceback" not in done.stderr
-        return done.stdout + done.stderr
+        return flat(done.stdout + done.stderr)
 
-    said_all = call("train", "my_arm:Arm", *SHORT)  # d = 128: 42 for each of three senses
+    # d = 128: 42 for each of three senses
+    said_all = call("train", "my_arm:Arm", *SHORT, "--eval.references")
     assert "'gear' is not used" in said_all
     assert "there will be no videos" in said_all
     assert "random actions" in said_all
@@ -125,11 +129,53 @@ def test_who_waits_for_the_end_of_an_episode_is_told(
 ) -> None:
     """Those of the dot have 20 steps."""
     monkeypatch.setattr("merl.training.stretch.LONG", long)
-    short = [*SHORT, "--agent", "proprio", "--eval.no-references", "--run-dir", str(tmp_path / "r")]
+    short = [*SHORT, "--agent", "proprio", "--run-dir", str(tmp_path / "r")]
     assert main(["train", "merl.envs.dot:whole", *short]) == 0
     assert main(["resume", str(tmp_path / "r"), "--steps", "280"]) == 0
-    out = " ".join(capsys.readouterr().out.split())
+    out = flat(capsys.readouterr().out)
     assert ("no episode has ended in" in out) == told
+
+
+class Logged(DotEnv):
+    """Logs every call that would move a robot."""
+
+    calls: ClassVar[list[str]] = []
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.render_mode = render_mode
+
+    def reset(self, **options: Any) -> Any:
+        self.calls.append("reset")
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        self.calls.append("step")
+        return super().step(action)
+
+
+def moves(tmp_path: Path, *flags: str) -> tuple[int, int]:
+    """Train for 100 steps of ten to an episode, evaluate two episodes; returns resets and steps."""
+    Logged.calls.clear()
+    arguments = ["train", "test_own_env:Logged", "--agent", "proprio", *SHORT, "--steps", "100"]
+    arguments += ["--eval.episodes", "2", "--agent.hidden-dim", "8", "--replay.batch-size", "8"]
+    assert main([*arguments, *flags, "--run-dir", str(tmp_path / "-".join(["run", *flags]))]) == 0
+    return Logged.calls.count("reset"), Logged.calls.count("step")
+
+
+def test_nothing_but_training_and_evaluation_moves_a_users_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    assert moves(tmp_path, "--eval.video", "none") == (10 + 2, 100 + 20)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "100 steps of test_own_env:Logged on cpu (how long they take is said after" in said
+    assert "49 steps of test_own_env:Logged on cpu take about 0:00:0" in said
+    assert "nothing to compare with (--eval.references takes 20 episodes" in said
+    assert moves(tmp_path) == (10 + 2 + 1, 100 + 20)  # whether it can be filmed
+    assert moves(tmp_path, "--eval.video", "none", "--eval.references") == (12 + 40, 120 + 400)
+    resets, steps = moves(tmp_path, "--eval.video", "none", "--measure")
+    assert (resets > 12, steps) == (True, 120 + 75)
 
 
 @pytest.mark.parametrize("agent", ["ddpg", "sac", "merl_state"])
@@ -186,7 +232,7 @@ class Arm(gymnasium.Env):
 
     def step(self, action):
         self.taken += 1
-        if WHEN == "step" and self.taken == 250:
+        if WHEN == "step" and self.taken == 175:
             raise OSError("servo 3 does not answer")
         if WHEN == "evaluation" and self.taken == 40 and self.render_mode:
             return {"joints": np.full(4, np.nan, np.float32)}, 0.0, False, False, {}
@@ -223,12 +269,12 @@ def test_what_the_users_code_raises_is_told_and_the_run_saved(
     assert main(["train", task, *SHORT, "--eval.video", "none", "--run-dir", "run"]) == 4
     error = capsys.readouterr().err.strip()
     assert "step raised OSError: servo 3 does not answer (arm_that_fails_step.py, line 2" in error
-    assert "go on with `merl resume run`" in error
+    assert f"go on with `merl resume {tmp_path}/run`" in error
     assert len(error.splitlines()) == 1
     saved = max(int(path.name) for path in Path("run/checkpoints").iterdir())
     assert saved > 0
     module = Path("arm_that_fails_step.py")
-    module.write_text(module.read_text().replace("self.taken == 250", "False"))
+    module.write_text(module.read_text().replace("self.taken == 175", "False"))
     sys.modules.pop("arm_that_fails_step")
     assert main(["resume", "run"]) == 0
     assert rows(Path("run"))[-1]["step"] == "240"
@@ -239,7 +285,7 @@ def test_a_film_that_fails_stops_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["train", failing(tmp_path, "render"), *SHORT, "--run-dir", "run"]) == 0
-    assert "render raised RuntimeError: the display is gone" in capsys.readouterr().out
+    assert "render raised RuntimeError: the display is gone" in flat(capsys.readouterr().out)
 
 
 def test_a_nan_in_an_evaluation_stops_the_run(
@@ -255,9 +301,9 @@ def test_an_arm_that_has_become_another_is_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     task = failing(tmp_path, "never")
-    short = [*SHORT, "--eval.video", "none", "--eval.no-references"]
+    short = [*SHORT, "--eval.video", "none"]
     assert main(["train", task, *short, "--run-dir", "run"]) == 0
-    assert "there is nothing to compare with" in capsys.readouterr().out
+    assert "there is nothing to compare with" in flat(capsys.readouterr().out)
     module = Path("arm_that_fails_never.py")
     whole = module.read_text()
     for change, says in {
@@ -285,19 +331,34 @@ def test_an_arm_that_has_become_another_is_refused(
     ("arguments", "says"),
     [
         (["CartPole-v1"], "actions are Discrete(2)"),
-        (["Pendulum-v1"], "take --agent merl_state, ddpg or sac"),
         (["Pendulum-v1", "--agent", "drqv2"], "or take --agent merl_state, ddpg or sac"),
-        (["merl.envs.dot:whole", "--agent", "sac"], "agent.vectors names 'state'"),
+        (
+            ["merl.envs.dot:whole", "--agent", "sac", "--agent.vectors", "state"],
+            "agent.vectors names 'state', but the environment gives ['joints']",
+        ),
+        (["reach_duplo", "--env.image-layout", "chw"], "for an environment of your own"),
+        (["reach_duplo", "--env.allow-wide-actions"], "for an environment of your own"),
         (["Pendulum-v1", "--agent", "ddgp"], "did you mean 'ddpg'"),
         (["Pendulum-v1", "--agent", "ddpg", "--renderer", "gl"], "--renderer is for merl's own"),
         (["Pendulm-v1", "--agent", "ddpg"], "did you mean 'Pendulum-v1'"),
+        (["Reachr-v4"], "did you mean 'Reacher-v4'"),
+        (["Kitchen-v7"], "is unknown: choose from reach_duplo, move_box, lift_box, or name a"),
+        (["FetchReach-v4"], "package gymnasium-robotics: pip install 'gymnasium-robotics', then"),
+        (["FetchReach-v4"], "name it gymnasium_robotics:FetchReach-v4"),
+        (["gymnasium_robotics:FetchReach-v4"], "No module named 'gymnasium_robotics': it comes"),
+        (["AdroitHandDoor-v1"], "package gymnasium-robotics"),
+        (["AntMaze_UMaze-v4"], "package gymnasium-robotics"),
+        (["PandaReach-v3"], "name it panda_gym:PandaReach-v3"),
+        (["ALE/Pong-v5"], "name it ale_py:ALE/Pong-v5"),
+        (["PongNoFrameskip-v4"], "package ale-py"),
+        (["dm_control/cheetah-run-v0"], "pip install 'shimmy[dm-control]'"),
         (["os:getcwd"], "gave str"),
         (["./my_robot.py:make"], "write it as my_robot:make_env"),
         ([":Foo"], "write it as my_robot:make_env"),
         (["gymnasium:make"], "takes no arguments"),
         (["merl/MoveBox-v0"], "call it move_box"),
         (["merl:merl/MoveBox-v0"], "call it move_box"),
-        (["merl.envs.dot:whole", "--agent", "ddpg"], "or have it give 'state'"),
+        (["merl.envs.dot:whole", "--agent", "ddpg", "--agent.vectors", "x"], "have it give 'x'"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(

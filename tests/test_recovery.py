@@ -8,12 +8,15 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.torch import load_file
 
+from helpers import flat, wait_for
 from merl.cli import main
 from merl.report.curves import read_metrics
 
@@ -32,7 +35,7 @@ def line(folder: Path, *more: str) -> list[str]:
         "--agent.hidden-dim": 32,
         "--random-steps": 100,
         "--seed-steps": 100,
-        "--updates-per-step": 0.5,
+        "--updates-per-step": 0.25,
         "--save-every": 0,
         "--eval.every": 200,
         "--eval.episodes": 2,
@@ -51,17 +54,24 @@ def saved(folder: Path) -> list[int]:
 
 
 def wait_until_saved(folder: Path, process: subprocess.Popen[str], beyond: int = 0) -> None:
-    deadline = time.monotonic() + 120
-    while not any(step > beyond for step in saved(folder)):
-        assert process.poll() is None, "it ended before it saved"
-        assert time.monotonic() < deadline, "it has not saved within two minutes"
-        time.sleep(0.01)
+    wait_for(lambda: any(step > beyond for step in saved(folder)), process)
 
 
 def start(arguments: list[str]) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [*MERL, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+
+
+@contextmanager
+def started(arguments: list[str]) -> Iterator[subprocess.Popen[str]]:
+    """A process that does not outlive the test."""
+    process = start(arguments)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def assert_same(one: Path, other: Path) -> None:
@@ -82,20 +92,21 @@ def assert_same(one: Path, other: Path) -> None:
             np.testing.assert_array_equal(values, metrics[1][name], err_msg=name)
 
 
-def killed_and_gone_on_with(tmp_path: Path, kills: int, more: tuple[str, ...] = ()) -> None:
+def killed_and_gone_on_with(
+    tmp_path: Path, kills: int, more: tuple[str, ...] = (), at: int = 0
+) -> None:
+    """Compare a whole run with one that is killed so often, the first time beyond step `at`."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert main(line(whole, *more)) == 0
     moment = random.Random(kills)
-    done, first = 0, line(parts, *more)
+    done, first = at, line(parts, *more)
     while kills:
-        process = start(first if not saved(parts) else ["resume", str(parts)])
-        wait_until_saved(parts, process, done)
-        time.sleep(moment.uniform(0.0, 0.3))
-        process.kill()
-        process.communicate()
+        with started(first if not saved(parts) else ["resume", str(parts)]) as process:
+            wait_until_saved(parts, process, done)
+            time.sleep(moment.uniform(0.0, 0.3))
         reached, before = int(read_metrics(parts)["step"][-1]), done
         done = saved(parts)[-1]
-        assert done >= before
+        assert done > before
         assert reached - done <= EPISODE, "more than one checkpoint's interval is lost"
         kills -= 1
         if done == STEPS:
@@ -105,12 +116,20 @@ def killed_and_gone_on_with(tmp_path: Path, kills: int, more: tuple[str, ...] = 
 
 
 def test_killed_at_any_moment_it_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
-    killed_and_gone_on_with(tmp_path, 3)
+    killed_and_gone_on_with(tmp_path, 2)
 
 
 @pytest.mark.parametrize("more", [(), ("--replay.compress",)])
 def test_so_it_does_where_the_ring_has_wrapped(tmp_path: Path, more: tuple[str, ...]) -> None:
-    killed_and_gone_on_with(tmp_path, 2, ("--replay.capacity", "200", *more))
+    killed_and_gone_on_with(tmp_path, 1, ("--replay.capacity", "200", *more), at=240)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("more", [(), ("--replay.compress",)])
+def test_so_it_does_where_the_ring_wraps_between_kills(
+    tmp_path: Path, more: tuple[str, ...]
+) -> None:
+    killed_and_gone_on_with(tmp_path, 4, ("--replay.capacity", "200", *more))
 
 
 @pytest.mark.long
@@ -134,16 +153,14 @@ def signalled(tmp_path: Path, numbers: list[int]) -> None:
     often = ["--eval.every", "20", "--eval.video", "each", "--steps", "100000"]
     for number in numbers:
         done = saved(folder)[-1] if saved(folder) else 0
-        process = start(["resume", str(folder)] if done else line(folder, *often))
-        wait_until_saved(folder, process, done)
-        time.sleep(moment.uniform(0.0, 1.0))
-        process.send_signal(number)
-        begun = time.monotonic()
-        out, err = process.communicate(timeout=30)
+        with started(["resume", str(folder)] if done else line(folder, *often)) as process:
+            wait_until_saved(folder, process, done)
+            time.sleep(moment.uniform(0.0, 1.0))
+            process.send_signal(number)
+            out, err = process.communicate()
         assert process.returncode == 128 + number, err
         assert "Traceback" not in err
-        assert f"merl resume {folder}" in " ".join(out.split())
-        assert time.monotonic() - begun < 30
+        assert f"merl resume {folder}" in flat(out)
     assert main(["resume", str(folder), "--steps", str(saved(folder)[-1] + 10)]) == 0
     steps = read_metrics(folder)["step"]
     assert (np.diff(steps) > 0).all()
@@ -151,15 +168,16 @@ def signalled(tmp_path: Path, numbers: list[int]) -> None:
 
 def test_a_folder_that_is_taken_away_is_not_made_anew(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    process = start(line(folder, "--steps", "100000"))
-    wait_until_saved(folder, process)
-    folder.rename(tmp_path / "elsewhere")
-    _, err = process.communicate(timeout=120)
+    with started(line(folder, "--steps", "100000")) as process:
+        wait_until_saved(folder, process)
+        folder.rename(tmp_path / "elsewhere")
+        _, err = process.communicate()
     assert process.returncode == 2
     assert "is gone" in err
     assert "Traceback" not in err
     assert not folder.exists()
-    assert main(["resume", str(tmp_path / "elsewhere"), "--steps", "1000"]) == 0
+    further = str(saved(tmp_path / "elsewhere")[-1] + EPISODE)
+    assert main(["resume", str(tmp_path / "elsewhere"), "--steps", further]) == 0
 
 
 def test_the_same_line_begins_goes_on_and_is_done(
@@ -171,7 +189,7 @@ def test_the_same_line_begins_goes_on_and_is_done(
     assert "is done: 200 of 200 steps" in capsys.readouterr().out
 
     assert main(line(folder, "--resume", "--steps", "300", "--eval.episodes", "1")) == 0
-    told = " ".join(capsys.readouterr().out.split())
+    told = flat(capsys.readouterr().out)
     assert "goes on at step 200 with steps 200 -> 300, eval.episodes 2 -> 1:" in told
 
     before = (folder / "config.json").read_bytes()
@@ -207,15 +225,16 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins(tmp_path: Path
     assert main(["resume", str(folder), "--steps", "220"]) == 0
 
 
-def test_a_soak_for_half_a_minute(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_a_soak_for_three_minutes(tmp_path: Path) -> None:
     """`docs/measure_soak.py` goes on for two hours."""
     without_end = ["--steps", "100000000", "--updates-per-step", "0.1"]
     flags = [*line(tmp_path)[2:-4], *without_end]  # the script says --run-dir
     script = Path(__file__).parents[1] / "docs" / "measure_soak.py"
     rows = tmp_path / "soak.csv"
-    command = [sys.executable, script, "--minutes", "0.5", "--least", "9", "--most", "14"]
+    command = [sys.executable, script, "--minutes", "3", "--least", "40", "--most", "60"]
     command += ["--task", "merl.envs.dot:whole", "--output", rows, f"--flags={' '.join(flags)}"]
-    done = subprocess.run([*map(str, command)], capture_output=True, text=True, timeout=180)
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     values = np.loadtxt(rows, delimiter=",", skiprows=1)
     assert len(values) >= 2

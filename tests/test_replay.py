@@ -10,7 +10,6 @@ import mmap
 import os
 import resource
 import tempfile
-import time
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +22,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from helpers import wait_for
 from merl.core import Batch, MerlError, Observation, Transition
 from merl.replay import Lanes, Replay, ReplayConfig, check_fits, pictures, replay_bytes, storage
 from merl.replay.pictures import ReadAhead
@@ -329,10 +329,7 @@ def test_pictures_that_are_on_the_disk_alone_are_fetched(tmp_path):
             end = np.array([9000, 50, 101 * mmap.PAGESIZE, pages * mmap.PAGESIZE])
             ReadAhead.ask(mapped, begin, end)
             wanted = {5000 // mmap.PAGESIZE, 9000 // mmap.PAGESIZE, 100, *range(290, pages)}
-            deadline = time.monotonic() + 10
-            while not wanted <= in_memory(mapped) and time.monotonic() < deadline:
-                time.sleep(0.01)
-            assert wanted <= in_memory(mapped)
+            wait_for(lambda: wanted <= in_memory(mapped))
 
 
 def in_memory(mapped: mmap.mmap) -> set[int]:
@@ -595,10 +592,24 @@ def test_a_state_that_is_not_held_is_refused(tmp_path):
     state = run.replay.state_dict()
     with pytest.raises(MerlError, match="does not hold moment 6"):
         make().load_state_dict(state)
-    run.play(20, 20)
-    with pytest.raises(MerlError, match="does not hold moment 6"):
-        run.replay.load_state_dict(state)
     check(run.replay, run.account)  # and nothing has changed
+
+
+def test_a_state_that_was_overwritten_and_not_kept_leaves_the_newer_steps(
+    tmp_path, monkeypatch, caplog
+):
+    """As on a disk that was full from the last checkpoint to the end."""
+    run = Run(tmp_path / "replay")
+    run.play(5)
+    state = run.replay.state_dict()
+    run.replay.settle()
+    monkeypatch.setattr("merl.replay.journal.Journal.keep", lambda *_, **__: None)
+    run.play(20, 20)
+    for ring in (run.replay, make(run.directory)):
+        ring.load_state_dict(state)
+        assert "has overwritten what it held at the checkpoint" in caplog.text
+        check(ring, run.account)
+        caplog.clear()
 
 
 def test_it_grows_when_opened_with_a_larger_capacity(tmp_path):

@@ -4,7 +4,20 @@ The public names are loaded when first used, so that a room which needs neither 
 (`merl.report`) does not pay for them.
 """
 
-from __future__ import annotations
+# Before these lines nothing is imported that Python has not loaded itself: `python -m merl.cli`
+# searches the working folder first, and that folder may be the run of a stranger.
+import os
+import sys
+
+if sys.argv[:1] == ["-m"] and "merl.cli" in sys.orig_argv and not sys.flags.safe_path:
+    try:
+        if sys.path[0] == os.getcwd():  # noqa: PTH109 (pathlib is not loaded yet)
+            del sys.path[0]
+    except OSError:  # the working folder was removed, so it is not searched
+        pass
+    _source = __file__.removesuffix(f"{os.sep}merl{os.sep}__init__.py")
+    if _source not in sys.path:
+        sys.path.append(_source)  # merl lies in the working folder; worker processes need it
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 RESAMPLES = 9_999
 
@@ -50,6 +49,8 @@ def bootstrap_interval(
     mean = float(sample.mean())
     if np.ptp(sample) == 0:
         return Interval(float(sample[0]), float(sample[0]), float(sample[0]))
+    from scipy import stats  # here, for it takes a second to import
+
     low, high = stats.bootstrap(
         (sample,),
         np.mean,
@@ -79,6 +80,8 @@ def wilson_interval(successes: int, n: int, level: float = 0.95) -> Interval:
     _check_level(level)
     if n < 1 or not 0 <= successes <= n:
         raise ValueError(f"{successes} successes in {n} trials")
+    from scipy import stats
+
     interval = stats.binomtest(int(successes), int(n)).proportion_ci(level, method="wilson")
     return Interval(successes / n, float(interval.low), float(interval.high))
 

@@ -37,16 +37,16 @@ def test_pendulum_is_swung_up(agent: str, seed: int, tmp_path: Path) -> None:
     assert mean_return(PENDULUM, agent, seed, tmp_path) > -250
 
 
-@pytest.mark.parametrize("agent", ["ddpg", "sac"])
-def test_pendulum_soon_swings_better_than_at_rest(agent: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("agent", "steps"), [("ddpg", 2500), ("sac", 3000)])
+def test_pendulum_soon_swings_better_than_at_rest(agent: str, steps: int, tmp_path: Path) -> None:
     still = returns_of(lambda env: env.action_space.low * 0, PENDULUM)
-    early = mean_return(PENDULUM, agent, 0, tmp_path, steps=4000)
+    early = mean_return(PENDULUM, agent, 0, tmp_path, steps=steps)
     assert early > sum(still) / len(still) / 2
 
 
 def test_the_dot_soon_comes_nearer_than_at_rest(tmp_path: Path) -> None:
     still = returns_of(lambda env: 0 * env.best_action(), WHOLE)
-    early = mean_return(WHOLE, "merl", 0, tmp_path, steps=2500)
+    early = mean_return(WHOLE, "merl", 0, tmp_path, steps=2000)
     assert early > (sum(still) / len(still) + optimum(WHOLE)) / 2
 
 

@@ -19,9 +19,9 @@ SPACE = spaces.Dict(
     {
         "image": spaces.Box(0, 255, (84, 84, 3), np.uint8),
         "proprio": spaces.Box(-np.inf, np.inf, (24,), np.float32),
-        "state": spaces.Box(-np.inf, np.inf, (40,), np.float32),
     }
 )
+WITH_STATE = spaces.Dict({**SPACE, "state": spaces.Box(-np.inf, np.inf, (40,), np.float32)})
 
 
 def make(config: MERLConfig, space: spaces.Dict = SPACE) -> DDPG:
@@ -61,10 +61,12 @@ def test_the_papers_networks() -> None:
     assert size(networks.critic) == 2 * one
 
 
-def test_all_but_the_state_is_sensed() -> None:
-    assert modalities(MERLConfig(), SPACE) == (("image",), ("proprio",))
-    assert modalities(MERLConfig(vectors=("state",)), SPACE) == (("image",), ("state",))
-    assert modalities(MERLConfig(images=()), SPACE) == ((), ("proprio",))
+def test_every_modality_is_used_unless_others_are_named() -> None:
+    assert modalities(MERLConfig(), WITH_STATE) == (("image",), ("proprio", "state"))
+    assert modalities(MERLConfig(vectors=("state",)), WITH_STATE) == (("image",), ("state",))
+    assert modalities(MERLConfig(images=()), WITH_STATE) == ((), ("proprio", "state"))
+    told_to_critic = MERLConfig(critic_vectors=("state",))
+    assert modalities(told_to_critic, WITH_STATE) == (("image",), ("proprio",))
 
 
 def test_what_does_not_split_evenly_is_rounded_down() -> None:
@@ -97,7 +99,7 @@ def test_what_does_not_split_evenly_is_rounded_down() -> None:
 )
 def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str) -> None:
     with pytest.raises(MerlError, match=says):
-        make(MERLConfig(**config))
+        make(MERLConfig(**config), WITH_STATE if "critic_vectors" in config else SPACE)
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def one_step_batch(generator: torch.Generator, size: int = 64) -> Batch:
     return Batch(state, action, reward, torch.zeros(size), state)
 
 
-@pytest.mark.parametrize("goal", [0.5, -2.0])
+@pytest.mark.parametrize("goal", [0.5, pytest.param(-2.0, marks=pytest.mark.long)])
 def test_the_temperature_settles_where_the_entropy_meets_its_target(goal: float) -> None:
     numbers = {"hidden_dim": 32, "learning_rate": 3e-3, "temperature": 0.05}
     config = SACConfig(**numbers, target_entropy=goal, precision="fp32")

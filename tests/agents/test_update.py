@@ -163,11 +163,8 @@ def test_single_precision(case: Case) -> None:
     check_single_precision(case)
 
 
-@pytest.mark.parametrize(
-    "case",
-    [PAPER_3, pytest.param(PAPER_6, marks=pytest.mark.long)],
-    ids=lambda case: case.name,
-)
+@pytest.mark.long
+@named_cases(PAPER_3, PAPER_6)
 def test_single_precision_at_the_papers_size(case: Case) -> None:
     """On few pictures, and two of three batches will do.
 

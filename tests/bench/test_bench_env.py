@@ -4,6 +4,7 @@ import json
 
 from rich.console import Console
 
+from helpers import flat
 from merl.bench import env as bench
 from merl.core import MerlError
 
@@ -12,7 +13,7 @@ def text_of(result):
     console = Console(width=200, markup=False)
     with console.capture() as capture:
         console.print(bench.table(result))
-    return capture.get()
+    return flat(capture.get())
 
 
 def test_every_side_is_timed():

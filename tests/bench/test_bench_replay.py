@@ -5,6 +5,7 @@ import json
 import pytest
 from rich.console import Console
 
+from helpers import flat
 from merl.bench import replay as bench
 from merl.core import MerlError
 
@@ -15,7 +16,7 @@ def test_both_sides_are_timed():
     console = Console(width=300, markup=False)
     with console.capture() as capture:
         console.print(bench.table(result))
-    shown = capture.get()
+    shown = flat(capture.get())
     for side in (bench.RAW, bench.COMPRESSED):
         assert side in shown
         assert 0 < result["sample_ms"][side]["median"] <= result["ready_ms"][side]["high"]

@@ -4,6 +4,7 @@ import json
 
 from rich.console import Console
 
+from helpers import flat
 from merl.bench import train
 
 
@@ -15,4 +16,4 @@ def test_every_way_to_run_the_loop_is_timed() -> None:
     json.dumps(result)
     console = Console(width=120, record=True)
     console.print(train.table(result))
-    assert "beside the learner" in console.export_text()
+    assert "beside the learner" in flat(console.export_text())

@@ -22,6 +22,33 @@ def test_evaluate_finds_the_task_solved():
     assert result.returns.low > 150.0
 
 
+def solves(task, seed, **form):
+    env = make_env(task, observations=("proprio",), **form)
+    policy = ExpertPolicy(env)
+    observation, _ = env.reset(seed=seed)
+    over = False
+    while not over:
+        observation, _, _, over, info = env.step(policy(observation))
+    env.close()
+    return info["success"] == 1.0
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(77002, id="box scrapes along the floor"),
+        pytest.param(600006, id="fast plans need a detour"),
+        pytest.param(600019, id="finger scrapes along the floor"),
+    ],
+)
+def test_expert_solves_occluded_starts_that_need_care(seed):
+    assert solves("move_box", seed, occluded=True)
+
+
+def test_expert_keeps_a_carried_box_off_the_disc():
+    assert solves("lift_box", 77053, occluded=True)
+
+
 def test_an_action_asks_for_the_experts_velocities():
     env = make_env("reach_duplo", observations=("proprio",))
     policy = ExpertPolicy(env)
@@ -32,6 +59,29 @@ def test_an_action_asks_for_the_experts_velocities():
     velocities = policy._expert.act()
     env.step(env.action_for(velocities))
     np.testing.assert_allclose(env.physics.data.ctrl, velocities, rtol=0, atol=1e-6)
+
+
+def test_expert_follows_an_environment_that_is_closed_and_opened_again():
+    def actions(env, policy):
+        env.reset(seed=5)
+        policy.reset()
+        taken = []
+        for _ in range(3):
+            taken.append(policy(None))
+            env.step(taken[-1])
+        return np.array(taken)
+
+    env = make_env("reach_duplo", observations=("proprio",))
+    policy = ExpertPolicy(env)
+    expected = actions(env, policy)
+    env.close()
+    with pytest.raises(MerlError, match=r"call reset\(\) first"):
+        policy(None)
+    np.testing.assert_array_equal(actions(env, policy), expected)
+    env.close()
+    env.reset(seed=5)  # no policy.reset(): the episode is a new one all the same
+    np.testing.assert_array_equal(policy(None), expected[0])
+    env.close()
 
 
 def test_a_foreign_environment_is_met_with_one_sentence():

@@ -183,7 +183,7 @@ def test_a_bad_action_moves_nothing(blind, action, message):
         (
             "reach_duplo",
             {"renderer": "vulkan"},
-            "'vulkan' is unknown: choose from gl, warp",
+            "'vulkan' is unknown: choose from auto, gl, warp",
         ),
         ("reach_duplo", {"proprio": "some"}, "proprio 'some' is unknown"),
         ("reach_duplo", {"image_size": 15}, "image_size is 15: .* at least 16"),
@@ -216,15 +216,33 @@ def test_what_is_not_asked_for_is_not_computed(blind, monkeypatch):
     env.close()
 
 
-def test_closed_for_good():
-    env = make_env("reach_duplo", renderer="warp", observations=("state",))
-    env.reset(seed=0)
+def test_reset_after_close_opens_the_environment_again():
+    env = make_env(
+        "move_box", renderer="warp", image_size=16, render_size=16, render_mode="rgb_array"
+    )
+    expected = [*episode(env, seed=3), env.render()]
+    for _ in range(2):
+        env.close()
+        env.close()
+        for call in (env.render, lambda: env.physics, lambda: env.step(ACTION)):
+            with pytest.raises(MerlError, match=r"call reset\(\) first"):
+                call()
+        again = [*episode(env, seed=3), env.render()]
+        assert all(same(a, b) for a, b in zip(expected[:-1], again[:-1], strict=True))
+        np.testing.assert_array_equal(expected[-1], again[-1])
     env.close()
-    env.close()
-    with pytest.raises(MerlError, match="closed"):
-        env.reset()
-    with pytest.raises(MerlError, match="reset"):
-        env.step(ACTION)
+
+
+def test_reset_after_close_draws_on_from_the_same_generator():
+    starts = []
+    for closes in (False, True):
+        env = make_env("reach_duplo", renderer="warp", observations=("state",))
+        env.reset(seed=0)
+        if closes:
+            env.close()
+        starts.append(env.reset()[0]["state"])
+        env.close()
+    np.testing.assert_array_equal(*starts)
 
 
 def test_gymnasium_makes_every_task():
@@ -244,9 +262,16 @@ def test_gymnasium_makes_every_task():
         env.close()
 
 
+def test_auto_renderer_is_replaced_before_anything_records_it():
+    assert EnvConfig().renderer == EnvConfig(renderer="auto").renderer == "warp"
+    assert EnvConfig(renderer="gl").renderer == "gl"
+    with pytest.raises(MerlError, match="renderer"):
+        EnvConfig(renderer="vulkan")
+
+
 def test_every_setting_is_a_plain_value():
     assert {field.name: field.default for field in fields(EnvConfig)} == {
-        "renderer": "gl",
+        "renderer": "auto",
         "image_size": 84,
         "proprio": "paper",
         "state": "absolute",

@@ -6,6 +6,7 @@ import signal
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium
 import numpy as np
@@ -14,7 +15,8 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from merl.core import EnvironmentFailed, MerlError, NotFinite
-from merl.envs.own import adapt, make_own
+from merl.envs.adapted import in_one_line
+from merl.envs.own import adapt, load_module, make_own
 
 
 class Given(gymnasium.Env[Any, Any]):
@@ -74,10 +76,12 @@ def test_channels_that_come_first_are_moved_not_mixed() -> None:
         np.testing.assert_array_equal(after[..., channel], before[channel])
 
 
-def test_what_is_neither_image_nor_vector_is_left_out_with_a_word() -> None:
+def test_what_is_neither_image_nor_vector_is_left_out_with_a_reason() -> None:
     space = spaces.Dict({"arm": vector(2), "gear": spaces.Discrete(3), "map": vector(4)})
-    with pytest.warns(UserWarning, match=r"'gear' is not used: Discrete\(3\)"):
-        env = adapt(Given(space))
+    env = adapt(Given(space))
+    assert env.get_wrapper_attr("left_out") == {
+        "gear": "Discrete(3): give it as one-hot, a float32 box of 3 numbers"
+    }
     assert set(env.observation_space) == {"arm", "map"}  # type: ignore[call-overload]
     assert set(env.reset()[0]) == {"arm", "map"}
 
@@ -115,7 +119,6 @@ def test_actions_are_rescaled_and_success_is_found() -> None:
         (spaces.Box(-1, 1, (4, 4), np.float32), None, "neither an image"),
     ],
 )
-@pytest.mark.filterwarnings("ignore:observation")
 def test_what_cannot_be_learnt_in_is_refused(space: Any, actions: Any, says: str) -> None:
     with pytest.raises(MerlError, match=says):
         adapt(Given(space, actions))
@@ -132,15 +135,15 @@ def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> 
         "limit = 3\n"
         "gymnasium.register('Robot-v7', entry_point=make)\n"
     )
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
+    load_module("my_robot_here:make", tmp_path)
     assert make_own("my_robot_here:make").unwrapped.g == 1.0  # type: ignore[attr-defined]
     assert make_own("my_robot_here:Robot-v7", "rgb_array").render_mode is None
     for task, says in {
         "Pendulm-v1": "did you mean 'Pendulum-v1'",
         "reach_dulpo": "did you mean 'reach_duplo'",
         "zzz": "choose from reach_duplo, move_box, lift_box, or name a Gymnasium id",
-        "no_such_module:make": "call merl where it lies",
+        "no_such_module:make": "name its folder in PYTHONPATH",
         "my_robot_here:maker": "has no function 'maker'",
         "my_robot_here:limit": "a function is needed",
         "my_robot_here:number": "gave int",
@@ -165,7 +168,7 @@ def test_what_an_environment_gives_is_held_to_its_space(keys: tuple[str], says: 
     parts = {"top": image(20, 20, 3), "arm": vector(2)}
     env = Lying(spaces.Dict(parts))
     own = adapt(env)
-    own._spaces = {key: own._spaces[key] for key in keys}  # type: ignore[attr-defined]
+    own.modalities = {key: own.modalities[key] for key in keys}  # type: ignore[attr-defined]
     with pytest.raises(MerlError, match=says):
         own.reset()
 
@@ -260,15 +263,15 @@ def test_a_keyboard_interrupt_of_its_own_is_told(handler: Any, raised: type[Base
 
 
 def test_what_is_usual_is_taken() -> None:
-    env = adapt(Misgiving(step=lambda o: (o, np.ones(1), np.bool_(True), 0, {"success": None})))
+    env = adapt(Misgiving(step=lambda o: (o, np.ones(1), np.bool_(True), 0, {"lap": None})))
     env.reset()
     _, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
-    assert (reward, terminated, truncated, info) == (1.0, True, False, {})
+    assert (reward, terminated, truncated, info) == (1.0, True, False, {"lap": None})
 
 
 def test_an_old_reset_is_told() -> None:
     given = Misgiving(reset=({"arm": np.zeros(2)},))
-    with pytest.raises(EnvironmentFailed, match="reset gave 1 values: it must return observation"):
+    with pytest.raises(EnvironmentFailed, match="reset gave 1 value: it must return observation"):
         adapt(given).reset()
 
 
@@ -279,16 +282,6 @@ def test_no_motor_is_given_what_is_no_number() -> None:
     with pytest.raises(NotFinite, match="the environment is not given it"):
         env.step(np.array([0.0, np.nan], np.float32))
     assert not hasattr(given, "acted")
-
-
-@pytest.mark.parametrize("shape", [(3, 20, 30), (9, 48, 48), (12, 20, 30)])
-def test_stacked_channels_that_come_first(shape: tuple[int, ...]) -> None:
-    env = adapt(Given(image(*shape)))
-    assert env.observation_space["image"].shape == (*shape[1:], shape[0])  # type: ignore[index]
-
-
-def test_many_channels_that_come_last() -> None:
-    assert adapt(Given(image(48, 64, 12))).observation_space["image"].shape == (48, 64, 12)  # type: ignore[index]
 
 
 def test_keys_are_strings_and_spaces_are_there() -> None:
@@ -309,3 +302,53 @@ def test_a_close_that_fails_stops_nothing() -> None:
 
     with pytest.warns(UserWarning, match="close raised OSError: the port is busy"):
         adapt(Stuck(vector(2))).close()
+
+
+def place_of(path: Path, code: str) -> str:
+    """What is said of the exception that this file's `step` raises."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(code)
+    names: dict[str, Any] = {}
+    exec(compile(code, str(path), "exec"), names)
+    try:
+        names["step"]()
+    except Exception as error:
+        return in_one_line(error)
+    raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("inner", "raised"),
+    [
+        ("import json; json.loads('{')", "JSONDecodeError"),  # raised in the standard library
+        ("import numpy; numpy.linalg.inv([[0.0]])", "LinAlgError"),  # in an installed package
+        ("import gymnasium; gymnasium.make('No-v0')", "NameNotFound"),
+        ("exec(compile('1 / 0', '<string>', 'exec'))", "ZeroDivisionError"),
+        ("exec(compile('1 / 0', 'gone.py', 'exec'))", "ZeroDivisionError"),  # no such file
+        ("import merl.envs as e; e.make_env('x')", "MerlError"),
+        ("raise OSError('servo 3')", "OSError: servo 3"),
+    ],
+)
+def test_the_place_of_an_error_is_the_last_one_in_a_file_of_the_users(
+    inner: str, raised: str, tmp_path: Path
+) -> None:
+    told = place_of(tmp_path / "arm.py", f"def step():\n    {inner}\n")
+    assert told.startswith(raised)
+    assert told.endswith("(arm.py, line 2)")
+
+
+def test_a_place_that_cannot_be_opened_is_not_named(tmp_path: Path) -> None:
+    code = "def step():\n    raise OSError('servo 3')\n"
+    installed = tmp_path / "lib" / "site-packages" / "driver.py"
+    assert "driver.py" not in place_of(installed, code)
+    assert place_of(tmp_path / "merl_arm.py", code).endswith("(merl_arm.py, line 2)")
+    with patch("merl.envs.adapted.__file__", str(tmp_path / "merl" / "envs" / "adapted.py")):
+        assert "dot.py" not in place_of(tmp_path / "merl" / "dot.py", code)
+        assert place_of(tmp_path / "merl_arm" / "arm.py", code).endswith("(arm.py, line 2)")
+    (tmp_path / "gone.py").write_text(code)
+    names: dict[str, Any] = {}
+    exec(compile(code, str(tmp_path / "gone.py"), "exec"), names)
+    (tmp_path / "gone.py").unlink()
+    with pytest.raises(OSError, match="servo") as caught:
+        names["step"]()
+    assert "gone.py" not in in_one_line(caught.value)

@@ -7,7 +7,7 @@ from dm_control import mujoco as dm_mujoco
 
 from merl.core import MerlError
 from merl.envs import make_env
-from merl.envs.rasterizer import RasterRenderer
+from merl.envs.raster.renderer import RasterRenderer
 from merl.envs.rendering import check_renderer
 from merl.tasks import TASKS
 from merl.tasks.jaco import CAMERA

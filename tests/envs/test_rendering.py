@@ -50,7 +50,7 @@ def run(code, **environment):
         env={**inherited, **environment},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=900,
         check=False,
     )
 
@@ -198,7 +198,7 @@ def test_a_process_that_is_forked_after_a_picture_takes_pictures_too(warp_env):
             results = fork.Queue()
             child = fork.Process(target=look, args=(results,))
             child.start()
-            there = results.get(timeout=30)
+            there = results.get(timeout=600)
             child.join()
             print(there[0] == threads and (there[1] == here).all())
         """
@@ -223,9 +223,16 @@ def test_warp_needs_no_opengl_and_says_nothing_at_exit(warp_env):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_warp_works_where_the_opengl_asked_for_is_missing(warp_env):
-    done = run(HIDE_OPENGL + STEP.format(renderer="warp"), MUJOCO_GL="egl")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+def test_default_environment_works_where_the_opengl_asked_for_is_missing(warp_env):
+    code = """
+    import gymnasium, merl
+    for env in (gymnasium.make("merl:merl/ReachDuplo-v0"), merl.make_env("reach_duplo")):
+        assert env.reset(seed=0)[0]["image"].std() > 20
+        print(env.unwrapped.config.renderer)
+        env.close()
+    """
+    done = run(HIDE_OPENGL + textwrap.dedent(code), MUJOCO_GL="egl")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "warp\nwarp\n", "")
 
 
 HIDE_OPENGL = """
@@ -269,13 +276,19 @@ def test_gl_after_warp_in_one_process(opengl, warp_env):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-@pytest.mark.parametrize(("takes", "told"), [(0.5, True), (0.0, False)])
-def test_it_is_said_that_the_ray_tracer_is_compiled(capsys, takes, told):
-    with ray_tracing._told_if_it_takes_long(0.1):
-        time.sleep(takes)
-    time.sleep(0.2)
-    said = "merl: compiling the ray tracer, once, for 5 to 20 s\n"
-    assert capsys.readouterr().err == (said if told else "")
+def test_it_is_said_that_the_ray_tracer_is_compiled(capsys):
+    said, shown = "merl: compiling the renderer, once, for 5 to 20 s\n", ""
+    with ray_tracing.told_if_it_takes_long(0.1):
+        while not shown:  # as compiling does, this takes processor time
+            shown = capsys.readouterr().err
+    assert shown == said
+
+
+def test_on_a_busy_machine_loading_is_not_called_compiling(capsys):
+    with ray_tracing.told_if_it_takes_long(0.2) as watch:
+        time.sleep(0.5)  # another process has the processor
+    watch.join()
+    assert capsys.readouterr().err == ""
 
 
 def test_warp_works_without_a_home(tmp_path):

@@ -7,12 +7,13 @@ import pytest
 from merl.agents import AGENTS
 from merl.core import MerlError
 from merl.experiments.presets import PRESETS, PUBLISHED, compose
-from merl.training.config import TrainConfig
+from merl.training.config import EvaluationConfig, TrainConfig
 
 
 def test_preset_paper_is_table_1() -> None:
     config = compose("paper", "reach_duplo")
-    assert config == TrainConfig("reach_duplo")  # every default is the paper's
+    evaluation = EvaluationConfig(references=True)
+    assert config == TrainConfig("reach_duplo", eval=evaluation)  # every default is the paper's
     assert (config.steps, config.random_steps, config.seed_steps) == (1_000_000, 2000, 4000)
     assert (config.updates_per_step, config.action_repeat) == (1, 1)
     assert (config.env.renderer, config.env.image_size, config.env.proprio) == ("gl", 84, "paper")
@@ -24,6 +25,14 @@ def test_preset_paper_is_table_1() -> None:
     assert (agent.noise_std, agent.noise_clip, agent.shift_pad) == (0.2, 0.3, 4)
     assert (agent.conv_channels, agent.conv_strides) == (32, (2, 1, 1, 1))
     assert (agent.hidden_dim, agent.vector_encoder_dim) == (1024, 0)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_users_environment_is_not_moved_to_compare_unless_asked(preset: str) -> None:
+    assert compose(preset, "move_box").eval.references
+    assert not compose(preset, "my_robot:make").eval.references
+    assert not TrainConfig("my_robot:make").eval.references
+    assert not TrainConfig("my_robot:make").measure
 
 
 @pytest.mark.parametrize(("task", "layers"), [("reach_duplo", 3), ("move_box", 6), ("lift_box", 6)])

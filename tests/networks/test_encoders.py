@@ -25,6 +25,29 @@ def test_pixels_are_scaled_to_half_a_unit_on_each_side(shade: int) -> None:
     torch.testing.assert_close(encoder(stacks), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("low", "high"), [(0, 1), (0, 2), (0, 254), (0, 255), (1, 255), (200, 231)]
+)
+def test_pixels_are_scaled_by_their_own_bounds(low: int, high: int) -> None:
+    torch.manual_seed(0)
+    encoder = ConvEncoder(2, (5, 5), channels=4, strides=(2,), pixels=(low, high)).double()
+    stacks = torch.randint(low, high + 1, (3, 2, 5, 5, 1), dtype=torch.uint8)
+    stacks[0, 0, 0, 0], stacks[0, 0, 0, 1] = low, high
+    scaled = (stacks[..., 0].double() - low) / (high - low) - 0.5
+    expected = encoder.convolutions(scaled).permute(0, 2, 3, 1).flatten(1)
+    torch.testing.assert_close(encoder(stacks), expected, rtol=0, atol=1e-12)
+
+
+def test_in_bf16_a_mask_of_0_and_1_is_seen_as_exactly_as_a_picture() -> None:
+    torch.manual_seed(0)
+    encoder = ConvEncoder(9, (84, 84), pixels=(0, 1))
+    orthogonal(encoder)
+    mask = torch.randint(0, 2, (2, 3, 84, 84, 3), dtype=torch.uint8)
+    exact = encoder(mask)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert (encoder(mask) - exact).norm() < 0.01 * exact.norm()
+
+
 def test_in_bf16_a_dark_picture_and_a_bright_one_are_as_near_as_in_single_precision() -> None:
     """A bias that took in half of all weights would be rounded coarsely, the same for all."""
     torch.manual_seed(0)

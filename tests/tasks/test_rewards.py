@@ -145,11 +145,17 @@ def test_lift(
     assert np.array(list(terms.values())) == pytest.approx(np.array(expected) / 4, abs=1e-4)
 
 
-def test_a_tilted_hand_may_count_as_vertical() -> None:
-    upright = rewards.lift(0.3, 0.4, 0.025, 0.22, 0.2, vertical_cosine=0.4)["vertical"]
-    assert upright == 0.25
-    assert rewards.lift(0.3, 0.39, 0.025, 0.22, 0.2, vertical_cosine=0.4)["vertical"] < 0.25
-    assert rewards.lift(0.3, 0.4, 0.025, 0.22, 0.2)["vertical"] < 0.25
+@pytest.mark.parametrize(
+    ("cosine", "expected"),
+    [(1.0, 1.0), (0.4, 1.0), (0.39, 0.1 ** (0.01 / 0.4) ** 2), (0.2, 0.1**0.25), (0.0, 0.1)],
+)
+def test_vertical_bound_of_the_occluded_form_is_also_its_margin(
+    cosine: float, expected: float
+) -> None:
+    vertical = rewards.lift(0.3, cosine, 0.025, 0.22, 0.2, vertical_cosine=0.4)["vertical"]
+    assert vertical == pytest.approx(expected / 4, abs=1e-9)
+    if cosine < 0.99:
+        assert rewards.lift(0.3, cosine, 0.025, 0.18, 0.2)["vertical"] < 0.25
 
 
 def test_every_term_and_their_sum_stay_within_bounds() -> None:

@@ -1,13 +1,18 @@
 from __future__ import annotations
 
 import io
+import re
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from rich.console import Console
 
-from merl.training.console import ConsoleView, describe
-from merl.training.evaluation import summarize
+from helpers import flat
+from merl.training import console as console_module
+from merl.training.console import ConsoleView, describe, sparkline
+from merl.training.evaluation import Evaluation, summarize
 from merl.training.loop import Moment
 from merl.training.rollout import Episode
 
@@ -19,6 +24,25 @@ METRICS = {
     "learn/q": 4.5,
     "learn/critic_loss": 0.25,
 }
+SCALE = {"random actions": 7.8, "scripted expert": 219.4}
+
+
+class Clock:
+    """Stands in for time.perf_counter."""
+
+    def __init__(self) -> None:
+        self.seconds = 100.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The view's clock, which stands still until a test moves it."""
+    clock = Clock()
+    monkeypatch.setattr(console_module.time, "perf_counter", clock)
+    return clock
 
 
 def episodes() -> list[Episode]:
@@ -28,38 +52,182 @@ def episodes() -> list[Episode]:
     return [won, lost]
 
 
-def watch(terminal: bool) -> str:
-    shown = io.StringIO()
-    console = Console(file=shown, force_terminal=terminal, width=100)
-    run: Any = SimpleNamespace(config=SimpleNamespace(steps=1000, minutes=None))
-    with ConsoleView(console) as view:
-        view.begin(run, 0)
+def evaluation_of(value: float) -> Evaluation:
+    episode = Episode()
+    episode.add(value, {})
+    return summarize([episode])
+
+
+def new_run(steps: int = 1000, minutes: float | None = None, path: Path = Path("nowhere")) -> Any:
+    config = SimpleNamespace(
+        steps=steps, minutes=minutes, seed_steps=100, eval=SimpleNamespace(every=250)
+    )
+    return SimpleNamespace(config=config, path=path)
+
+
+def console_of(terminal: bool, width: int = 100, encoding: str = "utf-8") -> Console:
+    file = io.TextIOWrapper(io.BytesIO(), encoding=encoding, write_through=True)
+    return Console(
+        file=file, force_terminal=terminal, force_interactive=terminal, width=width, markup=False
+    )
+
+
+def text_of(console: Console) -> str:
+    file: Any = console.file
+    return file.buffer.getvalue().decode(file.encoding)
+
+
+def drawn(view: ConsoleView) -> str:
+    """What the live table shows now, with single spaces."""
+    with view.console.capture() as capture:
+        view.console.print(view._draw())
+    return flat(re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", capture.get()))
+
+
+def watch(terminal: bool, width: int = 100, encoding: str = "utf-8") -> str:
+    console = console_of(terminal, width, encoding)
+    with ConsoleView(console, SCALE) as view:
+        view.begin(new_run(), 0)
         for step in range(1, 251):
             view.moment(Moment(step, step), METRICS if step == 250 else {})
         view.evaluating(0, 2)
         view.evaluated(250, summarize(episodes()))
+        view.evaluated(251, evaluation_of(219.4))
         view.warn("the disk is full")
         view.saved(250)
-    return shown.getvalue()
+    return text_of(console)
 
 
 def test_a_terminal_shows_progress_speed_and_what_is_learnt() -> None:
-    shown = watch(terminal=True)
-    for said in ("250 of 1,000", "33 steps/s", "17 updates/s", "return 12.3, success 100%"):
-        assert said in shown
-    for said in ("Q 4.50", "at step 250", "warning: the disk is full", "saved at step 250"):
-        assert said in shown
-    assert shown.rstrip().endswith("\x1b[?25h")  # the cursor is back
+    for width in (60, 100):
+        shown = flat(watch(terminal=True, width=width))
+        for said in ("250 of 1,000", "33 steps/s, 17 updates/s", "return 12.3, success 100%"):
+            assert said in shown
+        for said in ("Q 4.50", "at step 250", "warning: the disk is full", "saved at step 250"):
+            assert said in shown
+        assert shown.rstrip().endswith("\x1b[?25h")  # the cursor is back
 
 
-def test_elsewhere_there_are_plain_lines() -> None:
-    shown = watch(terminal=False)
-    assert "\x1b" not in shown
-    assert "evaluation at step 250: return 1.5" in shown
-    assert "warning: the disk is full" in shown
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_elsewhere_there_are_plain_lines(encoding: str) -> None:
+    shown = watch(terminal=False, width=60, encoding=encoding)
+    assert shown.replace("\n", "").isprintable()
+    lines = shown.splitlines()
+    assert lines[0] == "returns to compare with: random actions 7.8, scripted expert 219.4"
+    assert lines[1].startswith("evaluation at step 250: return 1.5 [1.0, 2.0], success 50%")
+    assert lines[1].endswith("; at first an agent is often below random actions")
+    assert "below" not in lines[2]
+    high = "█" if encoding == "utf-8" else "#"
+    assert lines[3].startswith("returns of all evaluations: ")
+    assert f"{high} (scale: 1.5 to 219.4)" in lines[3]
+    assert lines[4] == "warning: the disk is full"
+
+
+def test_a_terminal_that_knows_ascii_alone_is_shown_ascii_alone() -> None:
+    watch(terminal=True, width=60, encoding="ascii")  # would raise UnicodeEncodeError
+
+
+def test_plain_lines_come_at_intervals_with_position_and_speed(clock: Clock) -> None:
+    console = console_of(terminal=False)
+    with ConsoleView(console) as view:
+        view.begin(new_run(minutes=10.0), 0)
+        for step, seconds in ((200, 10.0), (300, 25.0), (400, 31.0), (450, 40.0)):
+            clock.seconds = 100.0 + seconds
+            view.moment(Moment(step, step - 100), METRICS)
+    (line,) = text_of(console).splitlines()
+    assert line.startswith("00:31 of 10:00, or step 400 of 1,000 (40%, 01:03 left): training")
+    assert line.endswith("noise); 33 steps/s, 17 updates/s")
+
+
+@pytest.mark.parametrize(
+    ("minutes", "step", "seconds", "percent"),
+    [
+        (None, 250, 1e6, "25%"),
+        (10.0, 250, 60.0, "25%"),  # the steps are reached first
+        (10.0, 10, 300.0, "50%"),  # the minutes are reached first
+        (10.0, 10, 900.0, "100%"),  # the last evaluation
+    ],
+)
+def test_the_bar_runs_to_the_limit_that_is_reached_first(
+    minutes: float | None, step: int, seconds: float, percent: str, clock: Clock
+) -> None:
+    view = ConsoleView(console_of(terminal=False))
+    view.begin(new_run(minutes=minutes), 0)
+    view.moment(Moment(step, 0), {})
+    clock.seconds += seconds
+    shown = drawn(view)
+    assert shown.startswith(f"{percent} ")
+    if minutes is not None:
+        assert f"{min(seconds, 600) / 60:02.0f}:00 of 10:00, or step {step}" in shown
+
+
+def test_the_time_left_is_of_the_pace_with_updates(clock: Clock) -> None:
+    """Steps without updates are much faster: an estimate from them would be far too short."""
+    view = ConsoleView(console_of(terminal=False))
+    view.begin(new_run(), 0)
+    clock.seconds += 10.0
+    view.moment(Moment(100, 0), {})
+    assert "left" not in drawn(view)
+    view.moment(Moment(101, 1), {})
+    clock.seconds += 100.0
+    view.moment(Moment(201, 101), {})  # a step a second
+    assert "13:19 left" in drawn(view)
+    clock.seconds += 800.0
+    view.moment(Moment(1000, 900), {})
+    assert "left" not in drawn(view)
+
+
+def test_a_return_below_random_actions_is_explained() -> None:
+    view = ConsoleView(console_of(terminal=False), SCALE)
+    view.begin(new_run(), 0)
+    assert "compare with random actions 7.8, scripted expert 219.4" in drawn(view)
+    assert "below" not in drawn(view)
+    view.moment(Moment(50, 0), METRICS | {"train/return": 0.0})
+    shown = drawn(view)
+    assert "return 0.0" in shown
+    assert "learning begins at step 100" in shown
+    assert "at first an agent is often below random actions" in shown
+    view.evaluated(250, evaluation_of(100.0))
+    assert "below" not in drawn(view)
+
+
+def test_before_the_first_evaluation_its_step_is_shown() -> None:
+    view = ConsoleView(console_of(terminal=False))
+    view.begin(new_run(), 0)
+    shown = drawn(view)
+    assert "evaluation the first one after step 250, or at the end" in shown
+    assert "compare with" not in shown  # nothing is known
+
+
+def test_a_training_episode_without_success_counts_as_failed() -> None:
+    view = ConsoleView(console_of(terminal=False))
+    view.begin(new_run(), 0)
+    silent = {name: value for name, value in METRICS.items() if "success" not in name}
+    for step, metrics in enumerate((METRICS, silent, silent, silent)):
+        view.moment(Moment(step, 0), metrics)
+    assert "success 25%" in drawn(view)
+
+
+def test_a_resumed_run_shows_its_earlier_evaluations(tmp_path: Path) -> None:
+    (tmp_path / "metrics.csv").write_text("step,train/return,eval/return\n10,1,\n20,2,0.0\n")
+    view = ConsoleView(console_of(terminal=False))
+    view.begin(new_run(path=tmp_path), 20)
+    view.evaluated(30, evaluation_of(5.0))
+    assert "evaluations ▁█ (scale: 0.0 to 5.0)" in drawn(view)
+
+
+def test_a_sparkline_averages_what_does_not_fit() -> None:
+    assert sparkline([0.0, 3.5, 7.0], 0.0, 7.0) == "▁▅█"
+    assert sparkline([1.0], 1.0, 1.0) == "▁"
+    assert sparkline([0.0, 7.0] * 40, 0.0, 7.0, "_.-=+*%#") == "+" * 40
 
 
 def test_an_evaluation_in_one_line() -> None:
     line = describe(summarize(episodes()))
     assert line.startswith("return 1.5 [1.0, 2.0], success 50% [9%, 91%] at the end")
     assert line.endswith("(2 episodes)")
+
+
+def test_success_rates_that_are_equal_are_said_once() -> None:
+    line = describe(summarize(episodes()[1:]))
+    assert line == "return 1.0 [1.0, 1.0], success 0% [0%, 79%] at the end (1 episode)"

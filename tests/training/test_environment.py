@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from merl.agents import AGENTS
-from merl.core import MerlError
+from merl.core import EnvironmentFailed, MerlError
 from merl.envs.config import EnvConfig
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
+from merl.training.plain import from_plain, to_plain
+from toy import DotEnv
 
 WARP = EnvConfig(renderer="warp", image_size=32)
+
+
+def test_recorded_config_names_the_renderer_that_draws() -> None:
+    plain = to_plain(TrainConfig("reach_duplo", env=EnvConfig()))["env"]
+    assert plain["renderer"] == "warp"
+    assert from_plain(EnvConfig, plain | {"renderer": "auto"}).renderer == "warp"
 
 
 @pytest.mark.parametrize(
@@ -54,7 +66,11 @@ def test_the_dot_is_narrowed_as_well() -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"critic_vectors": ("proprio",)}, "which the actor has already"),
+        (
+            {"vectors": ("proprio",), "critic_vectors": ("proprio",)},
+            "which the actor has already",
+        ),
+        ({"images": (), "critic_vectors": ("proprio",)}, "leaves the actor nothing"),
         ({"critic_vectors": ("touch",)}, "agent.critic-vectors names 'touch'"),
         ({"critic_vectors": ("state",), "fusion": "shared"}, "use --agent.fusion decoupled"),
         (
@@ -68,3 +84,57 @@ def test_what_does_not_fit_is_named(change: dict, says: str) -> None:  # type: i
     agent = dataclasses.replace(AGENTS["merl"], **change)
     with pytest.raises(MerlError, match=says):
         make_run_env(TrainConfig("reach_duplo", agent=agent, env=WARP))
+
+
+class Greedy(DotEnv):
+    """Installs a handler of its own for Ctrl-C in every method."""
+
+    def __init__(self) -> None:
+        signal.signal(signal.SIGINT, lambda *_: None)
+        super().__init__()
+
+    def reset(self, **options: Any) -> Any:
+        signal.signal(signal.SIGINT, lambda *_: None)
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        signal.signal(signal.SIGINT, lambda *_: None)
+        raise OSError("the arm is gone")
+
+    def render(self) -> Any:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def close(self) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        raise KeyboardInterrupt
+
+
+def greedy() -> DotEnv:
+    return Greedy()
+
+
+def test_signal_handlers_are_put_back_after_every_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    config = TrainConfig("test_environment:greedy", agent=AGENTS["merl"])
+    env: Any = None
+
+    def make() -> None:
+        nonlocal env
+        env = make_run_env(config)
+
+    def step() -> None:
+        with pytest.raises(EnvironmentFailed, match="the arm is gone"):
+            env.step(np.zeros(1, np.float32))
+
+    def close() -> None:
+        with pytest.warns(UserWarning, match="was interrupted"):
+            env.close()
+
+    mine = signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        before = signal.getsignal(signal.SIGINT)
+        for call in (make, lambda: env.reset(seed=0), step, lambda: env.render(), close):
+            call()
+            assert signal.getsignal(signal.SIGINT) is before
+    finally:
+        signal.signal(signal.SIGINT, mine)

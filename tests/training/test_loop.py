@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from merl.training import loop
 from merl.training.acting import Here
 from merl.training.config import TrainConfig
 from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train, updates_due
-from merl.training.rollout import Episode, Fetched, FrameStack
+from merl.training.rollout import Episode, Fetched, FrameStack, mean_metrics
 from merl.training.updating import UpdateFromHost, UpdateOnDevice, update_from_host
 from toy import DotEnv
 
@@ -90,14 +91,28 @@ MANY = dataclasses.replace(
 )
 
 
-@pytest.mark.parametrize("step", [30, 31, 45, 60])
-@pytest.mark.parametrize("repeat", [1, 3])
+@cache
+def weights_of_a_whole_run(repeat: int) -> torch.Tensor:
+    whole = Parts(dataclasses.replace(MANY, action_repeat=repeat))
+    whole.run()
+    return whole.weights()
+
+
+@pytest.mark.parametrize(
+    ("step", "repeat"),
+    [
+        (31, 1),
+        (60, 1),
+        (45, 3),
+        *(pytest.param(*case, marks=pytest.mark.long)
+          for case in ((30, 1), (45, 1), (30, 3), (31, 3), (60, 3))),
+    ],
+)  # fmt: skip
 def test_a_stop_waits_for_no_more_than_one_update(step: int, repeat: int) -> None:
     """And what was left of a step is learnt as it would have been when the run goes on."""
     settings = dataclasses.replace(MANY, action_repeat=repeat)
     step += -step % repeat
-    whole, parts = Parts(settings), Parts(settings)
-    whole.run()
+    parts = Parts(settings)
     due = updates_due(step - 20, 7.0)
     told = stopped_after(due - 5, parts)
     assert (told.step, told.updates, parts.progress.updates) == (step, due - 4, due - 4)
@@ -106,7 +121,7 @@ def test_a_stop_waits_for_no_more_than_one_update(step: int, repeat: int) -> Non
     assert "critic_loss" in first.learning
     assert moments[-1].step == 60
     assert parts.progress.updates == 7 * 40
-    assert torch.equal(parts.weights(), whole.weights())
+    assert torch.equal(parts.weights(), weights_of_a_whole_run(repeat))
 
 
 def test_beside_the_environments_a_stop_waits_for_the_step() -> None:
@@ -272,6 +287,20 @@ def test_an_episode_sums_what_its_steps_bring() -> None:
     silent = Episode()
     silent.add(1.0, {})
     assert silent.metrics() == {"return": 1.0, "length": 1.0}
+    failed = {"success_end": 0.0, "success_any": 0.0, "success_share": 0.0}
+    assert silent.metrics(reports_success=True) == silent.metrics() | failed
+    assert mean_metrics([silent, silent], reports_success=True) == silent.metrics() | failed
+    assert mean_metrics([silent, episode])["success_any"] == 0.5
+
+
+def test_success_is_shared_among_the_steps_that_report_it() -> None:
+    episode = Episode()
+    for info in ({}, {"success": True}, {}, {"success": False}, {"success": True}):
+        episode.add(0.0, info)
+    assert episode.metrics()["success_share"] == 2 / 3
+    assert episode.metrics()["success_end"] == 1.0
+    episode.add(0.0, {})  # the last step does not say so
+    assert (episode.metrics()["success_end"], episode.metrics()["success_any"]) == (0.0, 1.0)
 
 
 def test_a_frame_that_is_refilled_does_not_change_the_stack() -> None:

@@ -33,3 +33,36 @@ def test_an_interval_of_nothing_is_always_over() -> None:
     interval = Interval(0.0, lambda: clock[0])
     clock[0] += 1e-3
     assert interval.is_due()
+
+
+def test_an_episode_that_takes_much_longer_is_saved_within() -> None:
+    """And again at its end, from which a run resumes exactly."""
+    clock = [0.0]
+    interval = Interval(300.0, lambda: clock[0])
+    clock[0] = 400.0
+    assert not interval.is_overdue()  # an episode may take so long
+    assert interval.is_due()
+    interval.saved()
+    clock[0] += 1799.0
+    assert not interval.is_overdue()
+    clock[0] += 2.0
+    assert interval.is_overdue()
+    interval.saved(within=True)
+    assert not interval.is_overdue()
+    clock[0] += 1.0
+    assert interval.is_due()
+    interval.saved()
+    clock[0] += 1.0
+    assert not interval.is_due()
+
+
+def test_where_no_episode_ends_saves_lie_twice_the_interval_apart() -> None:
+    clock = [0.0]
+    interval = Interval(300.0, lambda: clock[0])
+    saves = []
+    while clock[0] < 3600:
+        clock[0] += 1.0
+        if interval.is_overdue():
+            interval.saved(within=True)
+            saves.append(clock[0])
+    assert saves == [601.0, 1202.0, 1803.0, 2404.0, 3005.0]

@@ -264,3 +264,21 @@ def test_a_disk_that_is_full_from_the_start_until_the_end(tmp_path, disk, caplog
     assert len(caplog.records) == 1
     assert rows(tmp_path) == [["step", "a"], ["1", "1.0"]]  # `close` has brought it there
     assert [path.name for path in tmp_path.glob(".*")] == []
+
+
+def test_rows_that_are_not_on_the_disk_are_counted(tmp_path, disk):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(1, {"a": 1.0})
+        assert writer.unwritten == 0
+        disk.full = True
+        for step in (1, 2, 3):
+            writer.write(step, {"a": 2.0})
+            assert writer.unwritten == step
+        writer.trim(2)
+        assert writer.unwritten == 2
+        disk.full = False
+        writer.write(4, {"b": 1.0})
+        assert writer.unwritten == 0
+        disk.full = True
+        writer.write(5, {"b": 1.0})
+    assert writer.unwritten == 1

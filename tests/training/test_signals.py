@@ -1,23 +1,16 @@
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
 
 import pytest
 
-from merl.training.signals import Interrupt
-
-
-@pytest.fixture(autouse=True)
-def _hangups_are_heard() -> Iterator[None]:
-    """Under nohup they are not, and stay so."""
-    former = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, former)
+from merl.training.signals import Interrupt, handlers_kept
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
@@ -38,7 +31,8 @@ def test_a_second_hangup_lets_it_save() -> None:
         assert interrupt.number == signal.SIGHUP
 
 
-def test_the_same_signal_to_process_and_group_is_one() -> None:
+def test_the_same_signal_to_process_and_group_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("merl.training.signals._APART", 600.0)  # as far apart as on a busy machine
     with Interrupt().listening() as interrupt:
         for _ in range(2):
             os.kill(os.getpid(), signal.SIGTERM)
@@ -70,15 +64,17 @@ def test_a_second_signal_ends_at_once(number: int) -> None:
 
 def test_who_has_to_wait_is_told_for_what() -> None:
     program = (
-        "import os, signal, time; from merl.training import signals\n"
-        "signals.PATIENCE = 0.2\n"
-        "with signals.Interrupt().listening():\n"
-        "    os.kill(os.getpid(), signal.SIGINT); time.sleep(%s)\n"
-        "time.sleep(0.5)"
+        "import os, signal; from merl.training import signals\n"
+        "signals.PATIENCE = %s\n"
+        "with signals.Interrupt().listening() as interrupt:\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    timer = interrupt._telling\n"
+        "    if signals.PATIENCE < 1: timer.join()\n"
+        "timer.join()"
     )
-    for seconds, told in ((1.0, 1), (0.0, 0)):
+    for patience, told in ((0.1, 1), (600.0, 0)):
         done = subprocess.run(
-            [sys.executable, "-c", program % seconds], capture_output=True, check=True, text=True
+            [sys.executable, "-c", program % patience], capture_output=True, check=True, text=True
         )
         assert done.stderr.count("a second signal (Ctrl-C) stops at once") == told
 
@@ -94,3 +90,49 @@ def test_where_no_thread_is_to_be_had_it_is_a_wish_all_the_same(
     with Interrupt().listening() as interrupt:
         os.kill(os.getpid(), signal.SIGTERM)
         assert interrupt.number == signal.SIGTERM
+
+
+SIGINT_TAKEN_OVER = {
+    "by Python": lambda: signal.signal(signal.SIGINT, lambda *_: None),
+    "by Python, ignored": lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    "by a C library": lambda: ctypes.CDLL(None).signal(int(signal.SIGINT), ctypes.c_void_p(1)),
+}
+
+
+@pytest.mark.parametrize("how", SIGINT_TAKEN_OVER)
+def test_a_handler_that_is_taken_over_is_put_back(how: str) -> None:
+    former = signal.getsignal(signal.SIGINT)
+    with Interrupt().listening() as interrupt:
+        with handlers_kept():
+            SIGINT_TAKEN_OVER[how]()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert interrupt.number == signal.SIGINT
+    assert signal.getsignal(signal.SIGINT) == former
+
+
+def test_a_signal_that_another_handler_took_is_noted() -> None:
+    taken: list[int] = []
+    with Interrupt().listening() as interrupt:
+        with handlers_kept():
+            signal.signal(signal.SIGINT, lambda number, _: taken.append(number))
+            os.kill(os.getpid(), signal.SIGUSR1)  # merl's own
+            os.kill(os.getpid(), signal.SIGINT)
+        assert taken == [signal.SIGINT]
+        assert interrupt.number == signal.SIGUSR1
+    with Interrupt().listening() as interrupt:
+        with handlers_kept():
+            signal.signal(signal.SIGINT, lambda number, _: taken.append(number))
+            os.kill(os.getpid(), signal.SIGINT)
+        assert interrupt.number == signal.SIGINT
+
+
+def test_handlers_are_left_alone_in_another_thread() -> None:
+    def call() -> None:
+        with handlers_kept():
+            done.append(True)
+
+    done: list[bool] = []
+    thread = threading.Thread(target=call)
+    thread.start()
+    thread.join()
+    assert done == [True]

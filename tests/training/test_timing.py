@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ CONFIG = TrainConfig(
     "dot",
     steps=1000,
     seed_steps=200,
+    measure=True,
     replay=ReplayConfig(batch_size=4),
     agent=MERLConfig(latent_dim=8, hidden_dim=16),
 )
@@ -57,6 +59,23 @@ def test_a_frame_is_timed_where_videos_are_made() -> None:
     for config, filmed in ((CONFIG, True), (none, False)):
         timing = measure(config, env, eval_env, env.observation_space, torch.device("cpu"))
         assert (timing.frame > 0) == filmed
+
+
+class Untouchable(DotEnv):
+    """A robot that must not move."""
+
+    def reset(self, **_: Any) -> Any:
+        raise AssertionError("it was reset")
+
+    step = render = reset
+
+
+def test_environment_is_not_touched_unless_it_may_be_measured() -> None:
+    config = dataclasses.replace(CONFIG, measure=False)
+    env = Untouchable()
+    timing = measure(config, env, Untouchable(), env.observation_space, torch.device("cpu"))
+    assert not timing.knows_env
+    assert all(seconds > 0 for seconds in [*timing.update.values(), timing.step])
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,23 @@ class Slow(Plain):
         return super().step(action)
 
 
+class Beside(Plain):
+    """In a process of its own, a late step ends only once the learner learns beside it."""
+
+    def __init__(self) -> None:
+        self.all = 0
+
+    def step(self, action: Any) -> Any:
+        self.all += 1
+        if self.all >= 25 and multiprocessing.parent_process() is not None:
+            deadline = time.monotonic() + 60
+            while not (Path(os.environ["TURNS"]) / f"learns-{self.all}").exists():
+                if time.monotonic() > deadline:
+                    raise TimeoutError("nothing was learnt during this step")
+                time.sleep(0.001)
+        return super().step(action)
+
+
 class Failing(Plain):
     """Fails with an exception that another process cannot be told."""
 
@@ -168,6 +185,10 @@ def plain() -> Plain:
 
 def slow() -> Plain:
     return Slow()
+
+
+def beside() -> Plain:
+    return Beside()
 
 
 def dies() -> Plain:

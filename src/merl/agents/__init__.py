@@ -12,6 +12,7 @@ from merl.agents.merl import MERLConfig
 from merl.agents.networks import make_networks
 from merl.agents.sac import SAC, SACConfig
 from merl.networks.heads import Actor, GaussianActor
+from merl.networks.settings import torch_settings
 
 AGENTS: dict[str, AgentConfig] = {
     "merl": MERLConfig(),
@@ -33,15 +34,28 @@ def make_agent(
     frame_stack: int,
     seed: int,
     device: torch.device,
+    threads: int | None = None,
 ) -> DDPG:
-    """The agent of a config for these spaces, initialised from `seed`.
+    """Make the agent of a config for these spaces.
+
+    Args:
+        config: what it is made of.
+        observation_space: what the environment gives.
+        action_space: what it takes, (A,).
+        frame_stack: frames of an image that the agent sees at once.
+        seed: of its weights, noise and shifts.
+        device: where it lives.
+        threads: processor threads of acting and updates; None: as torch is set.
 
     Raises:
         MerlError: the observation lacks what the agent consumes, or the config does not fit it.
     """
-    torch.manual_seed(seed)
     actor = GaussianActor if isinstance(config, SACConfig) else Actor
-    networks = make_networks(config, observation_space, action_space.shape[0], frame_stack, actor)
-    if isinstance(config, SACConfig):
-        return SAC(networks, config, seed=seed, device=device)
-    return DDPG(networks, config, seed=seed, device=device)
+    with torch_settings(device, threads):
+        torch.manual_seed(seed)
+        networks = make_networks(
+            config, observation_space, action_space.shape[0], frame_stack, actor
+        )
+        if isinstance(config, SACConfig):
+            return SAC(networks, config, seed=seed, device=device, threads=threads)
+        return DDPG(networks, config, seed=seed, device=device, threads=threads)

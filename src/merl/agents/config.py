@@ -25,7 +25,8 @@ class AgentConfig:
     images: tuple[str, ...] | None = None
     """Image keys to see; every one that the environment gives, if not set."""
     vectors: tuple[str, ...] | None = None
-    """Vector keys to feel; every one that the environment gives but `state`, if not set."""
+    """Vector keys to feel; if not set, every one that the environment gives and that is not for the
+    critic alone. Of merl's own tasks `state` is used only if it is named."""
     critic_vectors: tuple[str, ...] = ()
     """Vector keys that the critic alone is told, e.g. `state`: what is known in training only."""
     learning_rate: float = 1e-4

@@ -23,6 +23,7 @@ from merl.agents.config import AgentConfig
 from merl.agents.networks import Networks
 from merl.core import Batch, Copies
 from merl.networks.augmentation import Crop, draw_shifts
+from merl.networks.settings import with_torch_settings
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class DDPG:
         config: how to learn; `precision` "auto" counts as fp32 here, `torch_compile` "auto" as no.
         seed: of the noise and the shifts.
         device: where everything lives.
+        threads: processor threads of acting and updates; None: as torch is set.
 
     Attributes:
         step: environment steps so far, which the noise may depend on; set by who drives it.
@@ -72,12 +74,18 @@ class DDPG:
     """
 
     def __init__(
-        self, networks: Networks, config: AgentConfig, *, seed: int, device: torch.device
+        self,
+        networks: Networks,
+        config: AgentConfig,
+        *,
+        seed: int,
+        device: torch.device,
+        threads: int | None = None,
     ) -> None:
         self.step = 0
         self.sigma: Tensor | None = None
         self.config = config
-        self.device = device
+        self.device, self.threads = device, threads
         self.networks = networks.to(device)
         # The target fuses with the most recent weights unless its config averages them too.
         self.critic_target = nn.ModuleDict(copy.deepcopy(self._averaged())).requires_grad_(False)
@@ -103,6 +111,7 @@ class DDPG:
 
     # Acting ---------------------------------------------------------------------------------
 
+    @with_torch_settings
     @torch.inference_mode()
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
         """a_t = pi(h_actor(f(o_image), g(o_prop))) + epsilon, epsilon ~ N(0, sigma^2) not clipped.
@@ -126,6 +135,7 @@ class DDPG:
         """One gradient step on critic, encoders and actor, and one step of the target."""
         return self.learn(batch.to(self.device), self.draw(len(batch.action)))
 
+    @with_torch_settings
     def learn(self, batch: Batch, draws: Draws) -> dict[str, Tensor]:
         """`update` with its random numbers given: augment and encode, critic, actor, target."""
         encoders = self.networks.encoders
@@ -203,6 +213,7 @@ class DDPG:
         recent: list[Tensor] = [p for part in self._averaged().values() for p in part.parameters()]
         torch._foreach_lerp_(average, recent, self.config.tau)
 
+    @with_torch_settings
     def draw(self, size: int) -> Draws:
         """The random numbers of the next update, from a batch of so many samples."""
         generator = self.learning
@@ -245,6 +256,7 @@ class DDPG:
             "learning": self.learning.get_state(),
         }
 
+    @with_torch_settings
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take back what `state_dict` gave."""
         self.networks.load_state_dict(state["networks"])

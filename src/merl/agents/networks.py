@@ -111,15 +111,18 @@ def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...]
     """
     images = _keys("images", config.images, [k for k, s in space.items() if is_image(s)])
     given = [k for k, s in space.items() if is_vector(s)]
-    vectors = _keys("vectors", config.vectors, given, default=[k for k in given if k != "state"])
+    actors = [key for key in given if key not in config.critic_vectors]
+    vectors = _keys("vectors", config.vectors, given, default=actors)
     if not images and not vectors:
         if config.vectors == () and config.images == ():
             hint = "name some with --agent.images or --agent.vectors"
         elif config.vectors == ():
             others = "merl_state, ddpg or sac" if given == ["state"] else "proprio"
             hint = f"it needs an image, a uint8 box (H, W, C), or take --agent {others}"
-        elif "state" in given:
-            hint = "name it with --agent.vectors state, or take --agent merl_state, ddpg or sac"
+        elif given:
+            hint = "--agent.critic-vectors leaves the actor nothing"
+        elif config.images == ():
+            hint = "it needs a vector, a box of n numbers, or take --agent drqv2"
         else:
             hint = "an image is a uint8 box (H, W, C), a vector a float box (n,)"
         raise MerlError(f"the agent finds nothing to sense among {sorted(space)}: {hint}")
@@ -177,7 +180,7 @@ def _fusion(config: AgentConfig, features: Mapping[str, int], share: int) -> Fus
 def _image_encoder(
     config: AgentConfig, key: str, space: spaces.Space[Any], stack: int
 ) -> ConvEncoder:
-    assert space.shape is not None
+    assert isinstance(space, spaces.Box)
     height, width, channels = space.shape
     if config.shift_pad >= min(height, width):
         raise MerlError(
@@ -186,7 +189,11 @@ def _image_encoder(
         )
     try:
         return ConvEncoder(
-            stack * channels, (height, width), config.conv_channels, config.conv_strides
+            stack * channels,
+            (height, width),
+            config.conv_channels,
+            config.conv_strides,
+            (int(space.low.min()), int(space.high.max())),
         )
     except MerlError as error:
         raise MerlError(f"observation {key!r}: {error}") from None

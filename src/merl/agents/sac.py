@@ -21,6 +21,7 @@ from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG, load_optimizer, step_optimizer
 from merl.agents.networks import Networks
 from merl.core import MerlError
+from merl.networks.settings import with_torch_settings
 
 
 @dataclass(frozen=True)
@@ -61,18 +62,26 @@ class SAC(DDPG):
         config: how to learn.
         seed: of the noise and the shifts.
         device: where everything lives.
+        threads: see `DDPG`.
     """
 
     config: SACConfig
 
     def __init__(
-        self, networks: Networks, config: SACConfig, *, seed: int, device: torch.device
+        self,
+        networks: Networks,
+        config: SACConfig,
+        *,
+        seed: int,
+        device: torch.device,
+        threads: int | None = None,
     ) -> None:
-        super().__init__(networks, config, seed=seed, device=device)
+        super().__init__(networks, config, seed=seed, device=device, threads=threads)
         start = math.log(config.temperature)
         self.log_alpha = torch.tensor(start, device=device, requires_grad=True)
         self.alpha_optimizer = self._adam([self.log_alpha])
 
+    @with_torch_settings
     @torch.inference_mode()
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
         """tanh(u), u ~ N(mu, sigma^2) when exploring, else tanh(mu); see `DDPG.act`."""
@@ -119,6 +128,7 @@ class SAC(DDPG):
             "alpha_optimizer": self.alpha_optimizer.state_dict(),
         }
 
+    @with_torch_settings
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take back what `state_dict` gave."""
         super().load_state_dict(state)

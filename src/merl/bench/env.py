@@ -14,7 +14,7 @@ import numpy as np
 from rich.table import Table
 
 from merl.bench.measuring import circumstances, seconds, shown, spread
-from merl.core import MerlError
+from merl.core import MerlError, counted
 from merl.envs import make_env
 from merl.envs.jaco_env import JacoEnv
 from merl.envs.rendering import check_renderer, make_renderer
@@ -96,7 +96,7 @@ def table(result: dict[str, Any]) -> Table:
     for side, rate in result["steps_per_s"].items():
         rows.add_row(side, shown(rate), shown(result["reset_ms"][side]))
     notes = [
-        f"{OURS}: a picture by {result['picture_threads']} threads",
+        f"{OURS}: a picture by {counted(result['picture_threads'], 'thread')}",
         f"the bar of one is {LEAST_RATE:g} steps/s",
         f"our code adds {shown(result['overhead'])} of physics and picture, of which it may add "
         f"{MOST_OVERHEAD:g}",

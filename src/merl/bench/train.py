@@ -18,7 +18,7 @@ from rich.table import Table
 
 from merl.agents import make_agent
 from merl.bench.measuring import Side, circumstances, shown, spread
-from merl.core import is_image
+from merl.core import counted, is_image
 from merl.experiments.presets import compose
 from merl.replay import Lanes
 from merl.resources import keep_freed_memory
@@ -116,9 +116,9 @@ def table(result: dict[str, Any]) -> Table:
     """What `run` returned, for people."""
     rows = Table(
         title=f"{result['task']}, preset {result['preset']}, "
-        f"{result['updates_per_step']:g} updates a step in "
-        f"{result['precision']} on {result['threads']} threads, median of {result['repeats']} "
-        "(least to most)"
+        f"{counted(result['updates_per_step'], 'update')} a step in "
+        f"{result['precision']} on {counted(result['threads'], 'thread')}, "
+        f"median of {result['repeats']} (least to most)"
     )
     for heading in ("", "steps/s", "to the strict loop"):
         rows.add_column(heading, justify="right" if heading else "left")

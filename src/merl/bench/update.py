@@ -21,7 +21,7 @@ from merl.agents import AGENTS, make_agent
 from merl.agents.ddpg import DDPG
 from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
 from merl.bench.plain import Encoder, Plain, Sample
-from merl.core import Batch, MerlError, Transition
+from merl.core import Batch, MerlError, Transition, counted
 from merl.replay import Replay, ReplayConfig
 from merl.replay.on_device import OnDevice
 from merl.training.parts import choose_device
@@ -126,7 +126,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
 def table(result: dict[str, Any]) -> Table:
     """What `run` returned, for people."""
     title = f"an update, batch {result['batch_size']}, median of {result['repeats']}"
-    rows = Table(title=f"{title} (least to most), {result['threads']} threads")
+    rows = Table(title=f"{title} (least to most), {counted(result['threads'], 'thread')}")
     for heading in ("", "updates/s", "times the reference", "bar"):
         rows.add_column(heading, justify="right" if heading else "left")
     bars = BARS_ON_GPU if result["machine"]["gpu"] else BARS
@@ -247,7 +247,7 @@ def _stable_baselines(batch_size: int, device: torch.device) -> Work:
         from stable_baselines3.common.logger import Logger
         from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
     except ImportError:
-        raise MerlError('not installed: pip install "merl[bench]"') from None
+        raise MerlError('not installed: pip install "merl-rl[bench]"') from None
 
     class Extractor(BaseFeaturesExtractor):  # type: ignore[misc]
         """The convolutions and the joints, side by side."""

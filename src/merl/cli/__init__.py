@@ -1,12 +1,14 @@
 """The command line.
 
 Exit codes (docs/running.md): 0 done; 2 bad input, told in one line; 3 a NaN or an infinity stopped
-the run; 4 an environment failed, a run that had begun is saved; 129, 130, 138 and 143 stopped by
-SIGHUP, Ctrl-C, SIGUSR1 or SIGTERM, likewise saved; 141 nobody reads what is written.
+the run; 4 an environment failed, a run that had begun is saved; 5 the run ended, but its end could
+not be saved; 129, 130, 138 and 143 stopped by SIGHUP, Ctrl-C, SIGUSR1 or SIGTERM, and saved; 141
+nobody reads what a command prints that does nothing else.
 """
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import re
@@ -20,6 +22,7 @@ from typing import Any
 
 import merl
 from merl.core import MerlError, meant
+from merl.training.output import tolerant_output
 
 # The modules are imported when called: a misspelt command should not wait for torch.
 COMMANDS = {
@@ -33,8 +36,37 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code."""
+    """Run a command; returns the exit code.
+
+    What it prints may be lost, the command is not ended by that; but one that only prints tells by
+    its exit code that nobody reads it.
+    """
     args = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        with tolerant_output() as (out, _):
+            code = _run(args)
+    except SystemExit:  # after printing help
+        if out.error is None:
+            raise
+        code = 0
+    if code != 0 or out.error is None or (args[:1] in _OBSERVED and not _asks_help(args)):
+        return code
+    if out.error.errno == errno.EPIPE:
+        return 128 + signal.SIGPIPE
+    with tolerant_output():
+        print(f"merl: error: the output was not written: {out.error.strerror}", file=sys.stderr)
+    return MerlError.exit_code
+
+
+_OBSERVED = (["train"], ["resume"])
+"""Commands that do not only print."""
+
+
+def _asks_help(args: Sequence[str]) -> bool:
+    return "-h" in args or "--help" in args
+
+
+def _run(args: list[str]) -> int:
     warnings.showwarning = _show_warning
     logging.basicConfig(format="merl: %(levelname)s: %(message)s", level=logging.WARNING)
     logging.addLevelName(logging.WARNING, "warning")
@@ -57,9 +89,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
     except KeyboardInterrupt as stop:
         return 128 + getattr(stop, "number", signal.SIGINT)
-    except BrokenPipeError:  # the reader has gone, e.g. `merl ... --help | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-
 from merl.bench import BENCHES
+from merl.cli.output import make_console
 from merl.cli.parsing import check_writable, parse, write_json
 from merl.core import MerlError, meant
 
@@ -34,7 +33,7 @@ def bench(args: list[str]) -> int:
     check_writable(output)
     run, show = BENCHES[args[0]]
     result = run(repeats=repeats)
-    Console(markup=False).print(show(result))
+    make_console().print(show(result))
     if output is not None:
         write_json(output, result)
     return 0

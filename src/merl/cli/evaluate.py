@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 
+from merl.cli.output import make_console
 from merl.cli.parsing import check_writable, parse, write_json
+from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
 from merl.report.references import references
+from merl.resources import allow_picture_threads
 from merl.training.console import describe
 from merl.training.evaluation import EVALUATION_SEED, load_policy
 from merl.training.evaluation import evaluate as evaluate_policy
-from merl.training.timing import use_threads
+from merl.training.run import Run
 from merl.training.video import MIN_SIDE
 
 
@@ -32,16 +35,24 @@ class EvaluateOptions:
     """How many episodes."""
     video: Path | None = None
     """Film the first episode into this file (MP4)."""
+    max_episode_steps: int | None = None
+    """Steps after which an episode is cut; as the run has it (--eval.max-episode-steps), if not
+    set."""
     checkpoint: str = "latest"
     """latest, best (by evaluation return), or a number of steps."""
     renderer: RendererName | None = None
     """What draws the pictures, if not what the agent was trained with."""
+    trust: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Import the environment that the run names, although you have not trained this run here: that
+    runs the code of whoever made the run."""
     json: Path | None = None
     """Also write every episode's seed, return and success into this file."""
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise MerlError(f"--episodes must be at least 1, not {self.episodes}")
+        if self.max_episode_steps is not None and self.max_episode_steps < 1:
+            raise MerlError(f"--max-episode-steps must be at least 1, not {self.max_episode_steps}")
         if self.video is not None and self.video.suffix.lower() not in ("", ".mp4"):
             raise MerlError(
                 f"--video {self.video}: videos are MP4; use {self.video.with_suffix('.mp4')}"
@@ -52,18 +63,32 @@ def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
     options = parse(EvaluateOptions, "merl evaluate", args)
     check_writable(options.json)
-    console = Console(markup=False)
+    # Absolute before any user code runs, which may change the working folder.
+    file, film = _absolute(options.json), _absolute(options.video)
+    console = make_console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
-    # As the run had it: several threads wait for each other where the machine does other work, too.
-    use_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))
+    # Actions take one thread (`load_policy`), pictures as many as in training.
+    allow_picture_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))
     changes: dict[str, Any] = {} if options.renderer is None else {"renderer": options.renderer}
     if options.video is not None:
         size = max(policy.config.env.render_size, MIN_SIDE)
         changes |= {"render_mode": "rgb_array", "render_size": size}
-    env = policy.make_env(**changes)
+    if options.trust:
+        tell_trusted(Run.open(options.run))
+    env = policy.make_env(trust=options.trust, **changes)
+    config = policy.config
+    if options.max_episode_steps is not None:
+        limited = dataclasses.replace(config.eval, max_episode_steps=options.max_episode_steps)
+        config = dataclasses.replace(config, eval=limited)
     try:
         result = evaluate_policy(
-            policy, env, options.episodes, reset=policy.reset, video=options.video
+            policy,
+            env,
+            options.episodes,
+            reset=policy.reset,
+            video=film,
+            max_steps=config.eval_steps,
+            reports_success=policy.reports_success,
         )
     finally:
         env.close()
@@ -71,16 +96,22 @@ def evaluate(args: list[str]) -> int:
     pictures = f"{seen} pictures" if seen else ""
     told = f"{options.run} at step {policy.step:,}{pictures}: {describe(result)}"
     console.print(told, highlight=False)
-    config = policy.config
     beside = references(config.task, config.env)
     if beside:
         console.print(comparison(config.task, result, beside), highlight=False)
     if options.video is not None:
         console.print(f"video: {options.video}", highlight=False, soft_wrap=True)
-    if options.json is not None:
+    if file is not None:
         rows = [
-            {"seed": EVALUATION_SEED + i, **episode.metrics()}
+            {
+                "seed": EVALUATION_SEED + i,
+                **episode.metrics(reports_success=result.success_end is not None),
+            }
             for i, episode in enumerate(result.episodes)
         ]
-        write_json(options.json, {"run": str(options.run), "step": policy.step, "episodes": rows})
+        write_json(file, {"run": str(options.run), "step": policy.step, "episodes": rows})
     return 0
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else path.absolute()

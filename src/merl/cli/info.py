@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 import merl
 from merl.bench.renderers import renderer_speeds
+from merl.cli.output import make_console
 from merl.cli.parsing import parse
-from merl.core import MerlError
+from merl.core import MerlError, counted
 from merl.experiments.presets import compose
 from merl.resources import available_memory, free_disk
 from merl.training.machine import machine, package_versions
@@ -29,9 +29,9 @@ def info(args: list[str]) -> int:
         """Show what this machine offers, measured here (takes half a minute)."""
 
     parse(command, "merl info", args)
-    console = Console(markup=False)
+    console = make_console()
     table = Table(show_header=False, box=None, padding=(0, 2))
-    with console.status("measuring"):
+    with console.status("measuring", spinner="line"):
         for name, value in _rows():
             table.add_row(name, value)
     console.print(table, highlight=False)
@@ -42,7 +42,7 @@ def _rows() -> Iterator[tuple[str, str]]:
     yield "merl", merl.__version__
     yield from package_versions().items()
     here = machine()
-    yield "processor", f"{here['processor']}, {here['cores']} cores"
+    yield "processor", f"{here['processor']}, {counted(here['cores'], 'core')}"
     yield "features", ", ".join(processor_features()) or "none of note"
     yield "GPU", here["gpu"] or "none that torch finds"
     yield "memory", f"{available_memory() / 1e9:.1f} GB available to this process"

@@ -10,8 +10,9 @@ from typing import Annotated, Literal
 import tyro
 
 from merl.cli.parsing import parse
-from merl.cli.running import go_on
+from merl.cli.running import go_on, tell_trusted
 from merl.core import MerlError
+from merl.training.resuming import reopened
 from merl.training.run import Run
 
 
@@ -27,6 +28,9 @@ class ResumeOptions:
     """Stop after this many minutes from now; if not set, only the steps count."""
     device: Literal["auto", "cpu", "cuda"] | None = None
     """Where the networks live from now on; where they were, if not set."""
+    trust: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Import the environment that the run names, although you have not trained this run here: that
+    runs the code of whoever made the run."""
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
@@ -38,9 +42,11 @@ def resume(args: list[str]) -> int:
     options = parse(ResumeOptions, "merl resume", args)
     run = Run.open(options.run)
     asked = dataclasses.replace(
-        run.config,
+        reopened(run.config),
         steps=options.steps or run.config.steps,
         minutes=options.minutes,
         device=options.device or run.config.device,
     )
-    return go_on(run, asked)
+    if options.trust:
+        tell_trusted(run)
+    return go_on(run, asked, ["device"], trusted=options.trust)

@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
+from collections.abc import Collection
 from contextlib import ExitStack
-from datetime import timedelta
+from pathlib import Path
 
-from rich.console import Console
 from rich.filesize import decimal
 
+from merl.cli.duration import DurationView, duration
+from merl.cli.output import make_console
 from merl.cli.summary import summarize
-from merl.core import MerlError, is_image
+from merl.core import MerlError, NotSaved, counted, is_image
 from merl.replay import replay_bytes
+from merl.report.references import EXPERT, RANDOM, references
 from merl.training import trainer
 from merl.training.checkpoint import Checkpoint
 from merl.training.config import TrainConfig
 from merl.training.console import ConsoleView
-from merl.training.environment import own_bounds
-from merl.training.parts import Parts
-from merl.training.resuming import taken_up
-from merl.training.run import Run, resume_line
+from merl.training.environment import key_lines, own_bounds
+from merl.training.parts import Parts, device_name
+from merl.training.resuming import REOPENED, left_open, reopened, taken_up
+from merl.training.run import Run
+from merl.training.run_folder import check_links, resume_line
+from merl.training.stretch import Outcome
+
+DAY = 86_400.0  # seconds
 
 
 def begin(config: TrainConfig, what: str) -> int:
@@ -32,31 +40,53 @@ def begin(config: TrainConfig, what: str) -> int:
     return _train(config, what)
 
 
-def go_on(run: Run, asked: TrainConfig) -> int:
+def go_on(
+    run: Run,
+    asked: TrainConfig,
+    given_open: Collection[str] = (),
+    *,
+    trusted: bool = False,
+    named_in: Path | None = None,
+) -> int:
     """Train a run from its last whole checkpoint to its end; returns the exit code.
 
     Args:
-        run: which.
-        asked: the config with which it is to go on.
+        run: the run.
+        asked: the config with which it continues; fields that are left open keep their values.
+        given_open: fields that the user has left open by name, as with `--agent.precision auto`.
+        trusted: the environment that the run names may be imported; see `Run.load_module`.
+        named_in: the folder in which the user has named the task.
 
     Raises:
-        MerlError: that would be another run, another process trains it, or it has nothing to go on
-            from.
+        MerlError: that would be another run, another process trains it, it has nothing to go on
+            from, or its environment is not trusted.
     """
-    config, changes = taken_up(run.config, asked)
+    if asked.device == "auto" and "device" in given_open:
+        asked = dataclasses.replace(asked, device=device_name("auto"))
+    config, changes = taken_up(run.config, asked, given_open)
+    fixed = {name for name in REOPENED if name not in left_open(asked)}
+    run = dataclasses.replace(
+        run,
+        left_open=tuple(
+            name
+            for name in REOPENED
+            if name in given_open or (name in run.left_open and name not in fixed)
+        ),
+    )
     if run.has_moved() or config.device != run.config.device:
-        # What was decided for another machine or device is open again.
-        agent = dataclasses.replace(config.agent, precision="auto", torch_compile="auto")
-        config = dataclasses.replace(config, threads=None, agent=agent)
+        config = reopened(config, run.left_open)
+    check_links(run.path)
     with run.lock():
+        run.load_module(trusted=trusted, named_in=named_in)
         if run.begin_again():
             return _train(config, f"run {run.path} was ended before its first step", (run, None))
         start = Checkpoint.find(run.checkpoints)
         state = start.state()
         if config.steps < min(start.step, run.config.steps):
             raise MerlError(f"--steps {config.steps} is less than the {start.step:,} already taken")
-        if start.step >= config.steps and state["progress"]["evaluated"] == start.step:
-            steps = f"{start.step:,} of {config.steps:,} steps"
+        evaluated = not config.eval.every or state["progress"]["evaluated"] == start.step
+        if start.step >= config.steps and evaluated:
+            steps = f"{start.step:,} of {counted(config.steps, 'step')}"
             print(f"{run.path} is done: {steps}; --steps N takes it further")
             return 0
         if not run.replay.is_dir():
@@ -69,19 +99,32 @@ def go_on(run: Run, asked: TrainConfig) -> int:
         return _train(config, what, (run, start))
 
 
+def tell_trusted(run: Run) -> None:
+    """Say which code `--trust` is going to import."""
+    origin = run.origin()
+    if origin is not None:
+        print(f"merl: --trust: importing {origin}", file=sys.stderr)
+
+
 def _train(
     config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint | None] | None = None
 ) -> int:
-    console = Console(markup=False)
+    console = make_console()
     with ExitStack() as stack:
         try:
-            with console.status("building the scene and timing this machine"):
+            with console.status("building the scene and timing this machine", spinner="line"):
                 parts = stack.enter_context(Parts.prepare(config, new=resumed is None))
             if resumed:
                 resumed[0].check_environment(parts.space, parts.action_space, own_bounds(parts.env))
             done = resumed[1].step if resumed and resumed[1] else 0
             console.print(_outlook(parts, what, done), highlight=False)
-            with ConsoleView(console) as view:
+            scale = _scale(config)
+            view = (
+                ConsoleView(console, scale)
+                if parts.timing.knows_env
+                else DurationView(console, parts, scale)
+            )
+            with view:
                 if resumed:
                     outcome = trainer.resume(parts, *resumed, view)
                 else:
@@ -91,52 +134,73 @@ def _train(
             raise
     folder = outcome.run.path
     if outcome.signal is not None:
-        stopped = f"stopped at step {outcome.progress.step:,}"
-        how = (
-            "and saved: go on" if outcome.saved else "and not saved: go on from the last checkpoint"
-        )
-        console.print(f"{stopped} {how} with")
+        check_saved(outcome)
+        console.print(f"stopped at step {outcome.progress.step:,} and saved: go on with")
         console.print(f"    {resume_line(folder)}", highlight=False, soft_wrap=True)
         return 128 + outcome.signal
     try:
         summarize(outcome, console)
     except KeyboardInterrupt:
+        check_saved(outcome)
         console.print(f"{folder} is trained and saved", highlight=False, soft_wrap=True)
         raise
+    check_saved(outcome)
     return 0
 
 
+def check_saved(outcome: Outcome) -> None:
+    """Report what of a run's end is not on the disk.
+
+    Raises:
+        NotSaved: naming what is missing, its last checkpoint, or rows of its metrics.
+    """
+    run, rows = outcome.run, outcome.unwritten
+    lost = [] if outcome.saved else ["its checkpoint"]
+    lost += [f"{counted(rows, 'row')} of its metrics"] if rows else []
+    if not lost:
+        return
+    try:
+        last = f"step {Checkpoint.find(run.checkpoints).step:,}"
+    except MerlError:
+        last = "its start"
+    raise NotSaved(
+        f"{run.path} ended at step {outcome.progress.step:,}, but {' and '.join(lost)} could not "
+        f"be written: make room on the disk, then `{resume_line(run.path)}` continues from {last}"
+    )
+
+
+def _scale(config: TrainConfig) -> dict[str, float]:
+    """The returns that the live view shows beside the agent's; none for an unknown environment."""
+    return {
+        reference.name: reference.returns.mean
+        for reference in references(config.task, config.env)
+        if reference.name in (RANDOM, EXPERT)
+    }
+
+
 def _outlook(parts: Parts, what: str, done: int) -> str:
-    """What is going to happen, and how long it will take on this machine."""
+    """Return what is going to happen, and how long it will take on this machine."""
     config, timing = parts.config, parts.timing
-    seconds = timing.seconds(config, done)
     size = replay_bytes(
         config.replay, parts.space, parts.action_space, config.capacity, config.num_envs
     )
     tried = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
     seen = not config.own_env and any(is_image(space) for space in parts.space.values())
     pictures = f" ({config.env.renderer} pictures)" if seen else ""
-    lines = [
-        f"{what}: {_amount(config, done)} of {config.task} on {config.device} take about "
-        f"{timedelta(seconds=round(seconds))}",
-    ]
-    if seconds > 86_400 and config.preset != "laptop":
+    lines = [f"{what}: {duration(config, timing, done)}"]
+    if timing.seconds(config, done) > DAY and config.preset != "laptop":
         lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
+    lines += key_lines(config, parts.env)
+    step = "a step" if timing.knows_env else "a step, without the environment's part"
     lines += [
-        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms a step{pictures}",
-        f"the replay takes {decimal(size)} for {config.capacity:,} steps",
+        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms {step}{pictures}",
+        f"the replay takes {decimal(size)} for {counted(config.capacity, 'step')}",
     ]
     if timing.not_compiled is not None:
         lines.append(f"updates are not compiled, which fails here: {timing.not_compiled}")
     if (config.steps - config.seed_steps) * config.updates_per_step < 1:
         lines.append(
-            f"nothing will be learnt: the first update comes after {config.seed_steps:,} steps, "
-            "with --updates-per-step above 0"
+            "nothing will be learnt: the first update comes after "
+            f"{counted(config.seed_steps, 'step')}, with --updates-per-step above 0"
         )
     return "\n".join(lines)
-
-
-def _amount(config: TrainConfig, done: int) -> str:
-    """How much there is to do."""
-    steps = f"{config.steps - done:,} steps"
-    return steps if config.minutes is None else f"{config.minutes:g} minutes, or {steps},"

@@ -8,42 +8,53 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from merl.core import MerlError
-from merl.report.figures import learning_curve
-from merl.report.references import Reference, references
+from merl.core import MerlError, counted
+from merl.envs.adapted import in_one_line
+from merl.report.references import RANDOM, Reference, references
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env
 from merl.training.evaluation import Act, Evaluation, evaluate
-from merl.training.run import resume_line
+from merl.training.run_folder import resume_line
 from merl.training.stretch import Outcome
 
-FLOORS = ("random actions", "no motion")
+FLOORS = (RANDOM, "no motion")
 """The references that need no skill."""
 ENOUGH = 5
 """Episodes of an evaluation, below which its interval says nothing."""
 
 
 def summarize(outcome: Outcome, console: Console) -> None:
-    """Print the table, draw the curve, say plainly what was learnt, and how to go on."""
+    """Print the table, draw the curve, say plainly what was learnt, and how to go on.
+
+    The run is saved: what fails here is told in one line, and the rest goes on.
+    """
     run, trained = outcome.run, outcome.evaluation
-    if trained is None:
-        return
+    from merl.report.figures import learning_curve  # here, for Matplotlib is slow to import
+
     beside = references(run.config.task, run.config.env)
-    if not beside and run.config.eval.references:
-        with console.status(f"what {' and '.join(FLOORS)} are paid, to compare with"):
-            beside = _measured(run.config, console)
-    console.print()
-    console.print(comparison(run.config.task, trained, beside))
+    if trained is not None and not beside and run.config.eval.references:
+        with console.status(
+            f"what {' and '.join(FLOORS)} are paid, to compare with", spinner="line"
+        ):
+            beside = _measured(run.config, console, trained.success_end is not None)
+    if trained is not None:
+        console.print()
+        console.print(comparison(run.config.task, trained, beside))
     lines = {reference.name: reference.returns.mean for reference in beside}
     try:
         curve = learning_curve(run.path, run.path / "curve.png", references=lines)
         console.print(f"learning curve: {curve}", highlight=False, soft_wrap=True)
-    except MerlError as error:
-        console.print(f"the curve was not drawn: {error}", highlight=False)
+    except Exception as error:  # of matplotlib, too
+        console.print(f"the curve was not drawn: {_reason(error)}", highlight=False)
     videos = sorted(run.videos.glob("*.mp4")) if run.videos.is_dir() else []
     if videos:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
-    console.print(_verdict(beside, trained, outcome.progress.updates), highlight=False)
+    if trained is not None:
+        console.print(_verdict(beside, trained, outcome.progress.updates), highlight=False)
+    elif outcome.saved:
+        console.print(
+            f"{run.path} is trained and saved, and not evaluated", highlight=False, soft_wrap=True
+        )
     console.print(_way_on(outcome), highlight=False, soft_wrap=True)
     console.print(
         f"(its replay, {run.replay}, is only needed to go on, and may be deleted otherwise)",
@@ -53,7 +64,9 @@ def summarize(outcome: Outcome, console: Console) -> None:
     )
 
 
-def floors(config: TrainConfig, episodes: int = 20) -> tuple[Reference, ...]:
+def floors(
+    config: TrainConfig, episodes: int = 20, *, reports_success: bool = False
+) -> tuple[Reference, ...]:
     """Random actions, and none (the middle of their range), from the evaluation's starts."""
     env = make_run_env(config)
     rng = np.random.default_rng(0)
@@ -64,11 +77,15 @@ def floors(config: TrainConfig, episodes: int = 20) -> tuple[Reference, ...]:
         lambda _: np.zeros(shape, np.float32),
     )
     try:
-        results = [evaluate(act, env, episodes) for act in policies]
+        limit = config.eval_steps
+        results = [
+            evaluate(act, env, episodes, max_steps=limit, reports_success=reports_success)
+            for act in policies
+        ]
     finally:
         env.close()
     return tuple(
-        Reference(name, result.returns, result.success_end, f"{episodes} episodes")
+        Reference(name, result.returns, result.success_end, counted(episodes, "episode"))
         for name, result in zip(FLOORS, results, strict=True)
     )
 
@@ -76,7 +93,7 @@ def floors(config: TrainConfig, episodes: int = 20) -> tuple[Reference, ...]:
 def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> Table:
     """What was trained among its references."""
     table = Table("", "return", "success at the end", "from", title=task)
-    episodes = f"{len(trained.episodes)} episodes"
+    episodes = counted(len(trained.episodes), "episode")
     rows = [*beside, Reference("trained", trained.returns, trained.success_end, episodes)]
     for row in rows:
         returns = f"{row.returns.mean:.1f}"
@@ -90,13 +107,20 @@ def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> T
     return table
 
 
-def _measured(config: TrainConfig, console: Console) -> tuple[Reference, ...]:
+def _measured(
+    config: TrainConfig, console: Console, reports_success: bool
+) -> tuple[Reference, ...]:
     """What can be measured of the references that need no skill; the run is over in any case."""
     try:
-        return floors(config)
-    except MerlError as error:
-        console.print(f"there is nothing to compare with: {error}", highlight=False)
+        return floors(config, reports_success=reports_success)
+    except Exception as error:
+        console.print(f"there is nothing to compare with: {_reason(error)}", highlight=False)
         return ()
+
+
+def _reason(error: Exception) -> str:
+    """An exception in one line."""
+    return str(error) if isinstance(error, MerlError) else in_one_line(error)
 
 
 def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> str:
@@ -108,7 +132,10 @@ def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> 
         return "Nothing was learnt: there was no update."
     lower = [row for row in beside if row.name in FLOORS]
     if not lower:
-        return "Whether it has learnt cannot be said: there is nothing to compare with."
+        return (
+            "Whether it has learnt cannot be said: there is nothing to compare with "
+            "(--eval.references takes 20 episodes each of random actions and of no motion)."
+        )
     floor = max(lower, key=lambda row: row.returns.high)
     if trained.returns.low <= floor.returns.high:
         return (
@@ -116,9 +143,10 @@ def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> 
             f"{floor.name}."
         )
     if len(trained.episodes) < ENOUGH:
+        episodes = counted(len(trained.episodes), "episode")
         return (
-            f"Its return lies above that of {floor.name}, but {len(trained.episodes)} episodes are "
-            "too few to say that it has learnt: evaluate more (--eval.episodes)."
+            f"Its return lies above that of {floor.name}, but {episodes} cannot show that it has "
+            "learnt: evaluate more (--eval.episodes)."
         )
     return f"It has begun to learn: its return lies clearly above that of {floor.name}."
 

@@ -11,6 +11,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from merl.cli.output import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError
 from merl.envs import make_env
@@ -35,10 +36,13 @@ def tasks(args: list[str]) -> int:
         return pictures
 
     folder = parse(command, "merl tasks", args)
-    console = Console(markup=False)
+    console = make_console()
     for name in TASKS:
         picture = _picture(name)
         console.print(_entry(name, picture, console), highlight=False)
+        for line in _to_paste(name):
+            console.print(line, highlight=False, soft_wrap=True)
+        console.print()
         if folder is not None:
             path = folder / f"{name}.png"
             _write(path, picture)
@@ -53,15 +57,34 @@ def _entry(name: str, picture: NDArray[np.uint8], console: Console) -> Table:
         Text(name, style="bold"),
         Text(about),
         Text(f"reward: {' + '.join(terms)}, in [0, 1]; 250 steps of 0.04 s"),
-        Text(f"gymnasium.make('merl:{ENV_IDS[name]}')"),
-        Text(f"merl train {name}"),
+    ]
+    entry = Table.grid(padding=(0, 2))
+    shows_pictures = (
+        console.color_system is not None
+        and "utf" in (console.encoding or "").lower()
+        and console.width >= 2 * PICTURE_WIDTH
+    )
+    entry.add_row(*([_blocks(picture)] if shows_pictures else []), Group(*lines))
+    return entry
+
+
+def _to_paste(name: str) -> list[str]:
+    """Return lines that work as they are, on any machine, with what each is for.
+
+    Preset `laptop` is named because `paper`, the default beside CUDA, needs OpenGL.
+    """
+    lines = [
+        "in Python:",
+        f"    import gymnasium; env = gymnasium.make('merl:{ENV_IDS[name]}')",
+        "in a shell:",
+        f"    merl train {name} --preset laptop",
     ]
     if name in BOX_TASKS:
-        lines.append(Text(f"merl train {name} --occluded   (a disc hides the object)"))
-    entry = Table.grid(padding=(0, 2))
-    shows_pictures = console.color_system is not None and console.width >= 2 * PICTURE_WIDTH
-    entry.add_row(*([_blocks(picture)] if shows_pictures else []), Group(*lines, Text()))
-    return entry
+        lines += [
+            "and with a disc that hides the object:",
+            f"    merl train {name} --preset laptop --occluded",
+        ]
+    return lines
 
 
 def _picture(name: str) -> NDArray[np.uint8]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, cast
 
 import torch
@@ -14,6 +15,7 @@ from merl.cli.running import begin, go_on
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import PRESETS, compose
 from merl.training.config import Setting, TrainConfig
+from merl.training.resuming import decided, left_open
 from merl.training.run import Run
 
 
@@ -46,11 +48,18 @@ def train(args: list[str]) -> int:
             f"{', '.join(changed)} is for merl's own tasks: {config.task} decides for itself how "
             "it is seen"
         )
+    if not config.own_env and config.user_env != default.user_env:
+        raise MerlError(
+            f"--env.image-layout and --env.allow-wide-actions are for an environment of your own: "
+            f"leave them out for {config.task}"
+        )
     if options.resume:
         if config.run_dir is None:
             raise MerlError("--resume needs --run-dir: which run is to go on?")
         if (config.run_dir / CONFIG_FILE).exists():
-            return go_on(Run.open(config.run_dir), config)
+            closed = decided(compose(preset, task, agent, setting))
+            given_open = {*left_open(_parse(args, closed).config)} - {*left_open(closed)}
+            return go_on(Run.open(config.run_dir), config, given_open, named_in=Path.cwd())
     return begin(config, f"preset {preset} ({why}; {PRESETS[preset].about})")
 
 

@@ -6,6 +6,8 @@ from typing import Any, SupportsFloat
 
 import gymnasium
 
+from merl.envs.frame_rate import frame_rate
+
 
 class ActionRepeat(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An action is held until it was taken `repeat` times or the episode is over.
@@ -20,8 +22,8 @@ class ActionRepeat(gymnasium.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: gymnasium.Env[Any, Any], repeat: int) -> None:
         super().__init__(env)
         self.repeat = repeat
-        fps = env.metadata.get("render_fps")
-        if fps:  # films of it stay in real time
+        fps = frame_rate(env.metadata)
+        if fps is not None:  # videos of it stay in real time
             self.metadata = {**env.metadata, "render_fps": fps / repeat}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""A user's environment as agents take it: what it gives is checked, what it raises told."""
+"""A user's environment in the form that agents take; what it returns is checked."""
 
 from __future__ import annotations
 
@@ -16,87 +16,80 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from merl.core import EnvironmentFailed, MerlError, NotFinite, is_image, is_vector
+from merl.core import EnvironmentFailed, MerlError, NotFinite, counted
+from merl.envs.config import UserEnvConfig
+from merl.envs.user_spaces import Modality, action_bounds, advice, brief, modality
+from merl.envs.user_values import shown, to_bool, to_info, to_number
 
-MOST_CHANNELS = 4
-"""Of an image whose channels come last; with more, the smaller end has them."""
 
+def adapt(
+    env: gymnasium.Env[Any, Any], config: UserEnvConfig | None = None
+) -> gymnasium.Env[Any, Any]:
+    """Bring an environment into the form that agents take.
 
-def adapt(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-    """An environment in the form that agents take.
+    A plain box of numbers becomes `state`, a plain image `image`; of a `Dict` the images (uint8
+    boxes) and vectors (boxes of one axis) stay, the rest is left out. A box of finite actions is
+    rescaled to [-1, 1]. `info["is_success"]` counts as `success`.
 
-    A plain box of numbers becomes `state`, a plain picture `image`; of a `Dict` the images (uint8
-    boxes) and vectors (boxes of one axis) stay, with a warning for the rest. A box of finite
-    actions is rescaled to [-1, 1]. `info["is_success"]` counts as `success`.
+    Args:
+        env: the user's environment.
+        config: how its spaces are read.
 
     Raises:
-        MerlError: the actions are not a box of finite bounds, or nothing can be sensed.
+        MerlError: the actions are not a box of finite bounds, or no observation can be used.
     """
     for name in ("observation_space", "action_space"):
         if not isinstance(getattr(env, name, None), spaces.Space):
             raise MerlError(f"the environment has no {name}: set it to a gymnasium.spaces.Space")
-    actions = env.action_space
-    if (
-        not isinstance(actions, spaces.Box)
-        or len(actions.shape) != 1
-        or not np.issubdtype(actions.dtype, np.floating)
-    ):
-        raise MerlError(
-            f"the environment's actions are {actions}: an agent here gives a box of real numbers "
-            "(n,)"
-        )
-    if not np.isfinite([actions.low, actions.high]).all() or (actions.low > actions.high).any():
-        raise MerlError(
-            f"the environment's actions are {actions}: give them finite bounds, which are scaled "
-            "to [-1, 1]"
-        )
-    return Adapted(env)
+    return Adapted(env, config or UserEnvConfig())
 
 
 class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Observations as a `Dict` of images and vectors, actions in [-1, 1].
 
     Args:
-        env: whose observations are a box, or a `Dict` of boxes, and whose actions are a finite box.
+        env: its observations are a box or a `Dict` of boxes, its actions a finite box.
+        config: how its spaces are read.
 
     Attributes:
+        modalities: the observation keys that agents can use, with how each is converted.
+        left_out: the other keys, with the reason and the way out.
         own_bounds: the environment's bounds of each action, lower and upper.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], config: UserEnvConfig) -> None:
         super().__init__(env)
+        actions = env.action_space
+        self._low, self._high = action_bounds(actions, config.allow_wide_actions)
+        self._dtype = actions.dtype
+        self.own_bounds = self._low.tolist(), self._high.tolist()
+        self.action_space = spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
+
         given = env.observation_space
         self._plain = None if isinstance(given, spaces.Dict) else _plain_key(given)
         parts = given.spaces if isinstance(given, spaces.Dict) else {str(self._plain): given}
-        taken: dict[str, spaces.Space[Any]] = {}
+        self.modalities: dict[str, Modality] = {}
+        self.left_out: dict[str, str] = {}
         for key, part in parts.items():
             if not isinstance(key, str):
                 raise MerlError(
                     f"the environment's observation has the key {key!r}: name it with a string"
                 )
-            space = _taken(part)
-            if space is None:
-                warnings.warn(
-                    f"observation {key!r} is not used: {part} is neither an image (uint8, "
-                    f"H x W x C) nor a vector (n numbers){_remedy(part)}",
-                    stacklevel=1,
-                )
+            used = modality(key, part, config.image_layout)
+            if used is None:
+                self.left_out[key] = f"{brief(part)}: {advice(part)}"
             else:
-                taken[key] = space
-        if not taken:
+                self.modalities[key] = used
+        if not self.modalities:
+            reasons = [
+                reason if self._plain else f"{key!r} is {reason}"
+                for key, reason in self.left_out.items()
+            ]
             raise MerlError(
-                f"the environment's observation {given} has neither an image (a uint8 box, "
-                f"H x W x C) nor a vector (a box of n numbers){_remedy(given)}: wrap it so that it "
-                "has"
+                "the environment's observation has neither an image (a uint8 box, H x W x C) nor a "
+                f"vector (a box of n numbers): {'; '.join(reasons) or 'it is an empty Dict'}"
             )
-        self._spaces = taken
-        self.observation_space = spaces.Dict(taken)
-        actions = env.action_space
-        assert isinstance(actions, spaces.Box)
-        self._low, self._high = actions.low.astype(np.float64), actions.high.astype(np.float64)
-        self._dtype = actions.dtype
-        self.own_bounds = self._low.tolist(), self._high.tolist()
-        self.action_space = spaces.Box(-1.0, 1.0, actions.shape, np.float32)
+        self.observation_space = spaces.Dict({k: m.space for k, m in self.modalities.items()})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -104,27 +97,28 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Start an episode; see `gymnasium.Env.reset`.
 
         Raises:
-            EnvironmentFailed: it raised an exception, or gave what is no observation.
+            EnvironmentFailed: it raised an exception, or returned an invalid observation.
         """
         with failing("reset"):
             given = self.env.reset(seed=seed, options=options)
         observation, info = _apart("reset", given, ("observation", "info"))
-        return self._adapted(observation), _info(info)
+        return self._adapted(observation), to_info(info)
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], Any, bool, bool, Any]:
         """Take an action in [-1, 1]; see `gymnasium.Env.step`.
 
         Raises:
-            NotFinite: the action is no number; the environment is not given it.
-            EnvironmentFailed: it raised an exception, or gave what is no step.
+            MerlError: the action has another shape; the environment is not given it.
+            NotFinite: the action is not finite; the environment is not given it.
+            EnvironmentFailed: it raised an exception, or returned something invalid.
         """
         wanted = self._scaled(action)
         with failing("step"):
             given = self.env.step(wanted)
         names = ("observation", "reward", "terminated", "truncated", "info")
         observation, reward, terminated, truncated, info = _apart("step", given, names)
-        over = _truth("terminated", terminated), _truth("truncated", truncated)
-        return self._adapted(observation), _number("reward", reward), *over, _info(info)
+        over = to_bool("terminated", terminated), to_bool("truncated", truncated)
+        return self._adapted(observation), to_number("reward", reward), *over, to_info(info)
 
     def render(self) -> Any:
         """See `gymnasium.Env.render`.
@@ -144,12 +138,18 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
             warnings.warn(str(error), stacklevel=1)
 
     def _scaled(self, action: NDArray[np.float32]) -> NDArray[Any]:
-        """From [-1, 1] to the environment's own bounds, never beyond them."""
+        """Rescale from [-1, 1] to the environment's own bounds, never beyond them."""
         share = (np.asarray(action, np.float64) + 1.0) / 2.0
-        if not np.isfinite(share).all():
-            raise NotFinite(f"the action is {action}: the environment is not given it")
-        wanted = self._low + share * (self._high - self._low)
-        return wanted.clip(self._low, self._high).astype(self._dtype)
+        if share.shape != self._low.shape:
+            raise MerlError(f"action has shape {share.shape}: {self._low.shape} is needed")
+        wanted = (self._low + share * (self._high - self._low)).clip(self._low, self._high)
+        scaled: NDArray[Any] = wanted.astype(self._dtype)
+        if not (np.isfinite(wanted).all() and np.isfinite(scaled).all()):
+            raise NotFinite(
+                f"the action is {shown(action)}, rescaled {shown(scaled)}: the environment is not "
+                "given it"
+            )
+        return scaled
 
     def _adapted(self, observation: Any) -> dict[str, Any]:
         whole = observation if self._plain is None else {self._plain: observation}
@@ -158,14 +158,18 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
                 f"the environment's observation is of {type(whole).__name__}, but its space says a "
                 "dict"
             )
-        adapted = {}
-        for key, space in self._spaces.items():
+        for key in self.modalities:
             if key not in whole:
                 raise EnvironmentFailed(
                     f"the environment's observation lacks {key!r}, which its space has"
                 )
-            adapted[key] = _part(key, space, whole[key])
-        return adapted
+        return {key: used.convert(whole[key]) for key, used in self.modalities.items()}
+
+
+def _plain_key(space: spaces.Space[Any]) -> str:
+    """The key of an observation that has none."""
+    shape = space.shape or ()
+    return "image" if space.dtype == np.uint8 and len(shape) - shape.count(1) > 1 else "state"
 
 
 @contextmanager
@@ -191,115 +195,36 @@ def _ctrl_c_raises() -> bool:
 
 
 def in_one_line(error: BaseException) -> str:
-    """An exception's kind and text, and where in the user's own code it came from."""
+    """An exception's kind and text, and the last place in the user's own files that led to it."""
     text = " ".join(str(error).split())
     kind = type(error).__name__
-    told = f"{kind}: {text}" if text else kind
-    libraries = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib")]
-    ours = str(Path(__file__).parents[1])
+    described = f"{kind}: {text}" if text else kind
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if not frame.filename.startswith((*libraries, ours, "<")):
-            return f"{told} ({Path(frame.filename).name}, line {frame.lineno})"
-    return told
+        if _is_users(frame.filename):
+            return f"{described} ({Path(frame.filename).name}, line {frame.lineno})"
+    return described
+
+
+def _is_users(filename: str) -> bool:
+    """Whether code is in a file that exists, outside Python, installed packages and merl."""
+    path = Path(filename)
+    if filename.startswith("<") or not path.is_file():
+        return False
+    path = path.resolve()
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    libraries = [Path(sysconfig.get_path(name)).resolve() for name in names]
+    libraries.append(Path(__file__).resolve().parents[1])
+    return not (
+        any(path.is_relative_to(library) for library in libraries)
+        or {"site-packages", "dist-packages"} & {*path.parts}
+    )
 
 
 def _apart(what: str, given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
-    """What a call must give, as a tuple of so many."""
+    """The tuple that a call returned, checked for its length."""
     if not isinstance(given, tuple) or len(given) != len(names):
-        many = f"{len(given)} values" if isinstance(given, tuple) else type(given).__name__
+        many = counted(len(given), "value") if isinstance(given, tuple) else type(given).__name__
         raise EnvironmentFailed(
             f"the environment's {what} gave {many}: it must return {', '.join(names)}"
         )
     return given
-
-
-def _number(name: str, value: Any) -> float:
-    try:
-        return float(np.asarray(value).reshape(()).item())
-    except (TypeError, ValueError):
-        raise EnvironmentFailed(
-            f"the environment's {name} is {value!r}: it must be a number"
-        ) from None
-
-
-def _truth(name: str, value: Any) -> bool:
-    try:
-        return bool(value)
-    except (TypeError, ValueError):
-        raise EnvironmentFailed(
-            f"the environment's {name} is {value!r}: it must be true or false"
-        ) from None
-
-
-def _info(info: Any) -> dict[str, Any]:
-    """`info` with what agents' books are kept of: `success`, and `reward_terms` as numbers."""
-    if not isinstance(info, Mapping):
-        raise EnvironmentFailed(f"the environment's info is {info!r}: it must be a dict")
-    told = dict(info)
-    success = told.pop("success", told.get("is_success"))
-    if success is not None:
-        told["success"] = _truth('info["success"]', success)
-    if "reward_terms" in told:
-        terms = told["reward_terms"]
-        if not isinstance(terms, Mapping):
-            raise EnvironmentFailed(
-                f'the environment\'s info["reward_terms"] is {terms!r}: it must be a dict of '
-                "numbers"
-            )
-        told["reward_terms"] = {
-            str(name): _number(f"reward term {name!r}", value) for name, value in terms.items()
-        }
-    return told
-
-
-def _part(key: str, space: spaces.Space[Any], value: Any) -> NDArray[Any]:
-    """One modality as its space has it."""
-    array = np.asarray(value)
-    if is_image(space):
-        if array.dtype != np.uint8:
-            raise EnvironmentFailed(
-                f"observation {key!r} is of {array.dtype}, but its space says uint8: give pixels "
-                "from 0 to 255"
-            )
-        if array.ndim == 2:
-            array = array[..., None]
-        elif array.shape != space.shape and array.ndim == 3:
-            moved = np.moveaxis(array, 0, -1)
-            array = moved if moved.shape == space.shape else array
-    if array.shape != space.shape:
-        raise EnvironmentFailed(
-            f"observation {key!r} has shape {array.shape}, but its space says {space.shape}"
-        )
-    try:
-        return array.astype(space.dtype, copy=False)
-    except (TypeError, ValueError):
-        raise EnvironmentFailed(f"observation {key!r} holds what is no number: {value!r}") from None
-
-
-def _plain_key(space: spaces.Space[Any]) -> str:
-    """The key of an observation that has none."""
-    return "image" if space.dtype == np.uint8 and len(space.shape or ()) > 1 else "state"
-
-
-def _taken(space: spaces.Space[Any]) -> spaces.Box | None:
-    """The space as agents know it; None if it is neither image nor vector."""
-    if not isinstance(space, spaces.Box):
-        return None
-    if is_image(space) or (space.dtype == np.uint8 and len(space.shape) == 2):
-        shape = (*space.shape, 1) if len(space.shape) == 2 else space.shape
-        if shape[0] < shape[2] and shape[0] <= shape[1] and shape[2] > MOST_CHANNELS:
-            shape = (*shape[1:], shape[0])
-        return spaces.Box(0, 255, shape, np.uint8)
-    if is_vector(space) or len(space.shape) == 1:
-        low, high = space.low.astype(np.float32), space.high.astype(np.float32)
-        return spaces.Box(low, high, space.shape, np.float32)
-    return None
-
-
-def _remedy(space: spaces.Space[Any]) -> str:
-    """How to have it used, where that is plain."""
-    if isinstance(space, spaces.Dict):
-        return "; flatten what is nested, as gymnasium.spaces.utils.flatten does"
-    if isinstance(space, spaces.Box) and len(space.shape) in (2, 3):
-        return "; a picture of real numbers can be given as (255 * x).astype(uint8)"
-    return ""

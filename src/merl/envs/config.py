@@ -7,12 +7,18 @@ from typing import Literal, get_args
 
 from merl.core import MerlError, check_choice
 
-RendererName = Literal["gl", "warp"]
+RendererName = Literal["gl", "raster", "warp"]
+RendererChoice = Literal["auto", "gl", "raster", "warp"]
+AUTO_RENDERER: RendererName = "warp"
+"""The renderer that `auto` stands for: the only one that works on every machine, and the faster one
+where both were measured (docs/bench.md). It does not depend on the machine, so the same code sees
+the same pictures everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
 RewardName = Literal["paper", "staged", "near", "far", "both"]
 FloorName = Literal["rough", "smooth"]
+ImageLayout = Literal["auto", "hwc", "chw"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 
@@ -21,9 +27,10 @@ SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 class EnvConfig:
     """How an environment is seen."""
 
-    renderer: RendererName = "gl"
-    """What draws the pictures: `gl` (OpenGL, as dm_control does) or `warp` (a ray tracer that
-    needs no OpenGL and is much faster on a CPU; its pictures look slightly different)."""
+    renderer: RendererChoice = "auto"
+    """What draws the pictures: `gl` (OpenGL, as dm_control does), `warp` (a ray tracer that needs no
+    OpenGL and is much faster on a CPU) or `raster` (a z-buffer, four times as fast as `warp` and
+    nearer to `gl`). To an agent they are different cameras. `auto` is replaced by `warp`."""
 
     image_size: int = 84
     """Height and width of the agent's picture, in pixels; from 16 to 2048."""
@@ -62,7 +69,9 @@ class EnvConfig:
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
 
     def __post_init__(self) -> None:
-        check_choice("renderer", self.renderer, get_args(RendererName))
+        check_choice("renderer", self.renderer, get_args(RendererChoice))
+        if self.renderer == "auto":  # a config, and so a run's record, names what really draws
+            object.__setattr__(self, "renderer", AUTO_RENDERER)
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
         check_choice("reward", self.reward, get_args(RewardName))
@@ -88,3 +97,18 @@ class EnvConfig:
                     f"{field} is {size!r}: give a whole number, at least {SMALLEST_IMAGE} and at "
                     f"most {LARGEST_IMAGE}"
                 )
+
+
+@dataclass(frozen=True)
+class UserEnvConfig:
+    """How the spaces of a user's own environment are read."""
+
+    image_layout: ImageLayout = "auto"
+    """Order of the axes of the environment's images: `hwc` (height, width, channels), `chw`
+    (channels, height, width), or `auto`, which recognises the channels by their number."""
+
+    allow_wide_actions: bool = False
+    """Accept actions whose bounds are more than 1,000,000 apart."""
+
+    def __post_init__(self) -> None:
+        check_choice("env.image-layout", self.image_layout, get_args(ImageLayout))

@@ -29,8 +29,8 @@ class ExpertPolicy:
         jaco = env.unwrapped
         if not isinstance(jaco, JacoEnv):
             raise MerlError(f"there is no expert for {jaco}: it solves the tasks of merl.tasks")
+        self._env = jaco
         self._expert = Expert(jaco.task, jaco.physics)
-        self._to_action = jaco.action_for
         self._fresh = True
 
     def reset(self) -> None:
@@ -38,8 +38,14 @@ class ExpertPolicy:
         self._fresh = True
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """The action to take now, float32 (9,), in [-1, 1]."""
+        """Return the action to take now, float32 (9,), in [-1, 1].
+
+        Raises:
+            MerlError: the environment is closed.
+        """
+        if self._expert.physics is not self._env.physics:  # it was closed and opened again
+            self._expert, self._fresh = Expert(self._env.task, self._env.physics), True
         if self._fresh:
             self._expert.reset()
         self._fresh = False
-        return self._to_action(self._expert.act())
+        return self._env.action_for(self._expert.act())

@@ -47,9 +47,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if render_mode or "image" in config.observations:
             check_renderer(config.renderer)
         self.task, self.config, self.render_mode = task, config, render_mode
-        self._physics: Any = task.compile()
-        buffer = self._physics.model.vis.global_  # OpenGL's, which has to hold every picture
-        buffer.offwidth = buffer.offheight = max(config.image_size, config.render_size)
+        self._physics: Any = self._compile()
         self._renderers: dict[int, Renderer] = {}
         self._steps_left = 0
         low, high = self._physics.model.actuator_ctrlrange.T
@@ -61,7 +59,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode at random.
+        """Start an episode at random; after `close()` this opens the environment again.
 
         Args:
             seed: with it, the start depends on the seed alone, whatever was done before.
@@ -69,12 +67,9 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         Returns:
             The first observation, and `info`.
-
-        Raises:
-            MerlError: the environment was closed.
         """
         if self._physics is None:
-            raise MerlError("the environment is closed: make another one")
+            self._physics = self._compile()
         super().reset(seed=seed)
         random_state = np.random.RandomState(self.np_random.integers(2**32, dtype=np.uint32))
         self.task.start_episode(self._physics, random_state)
@@ -107,13 +102,17 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observe(), sum(terms.values()), False, truncated, self._info(terms)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A picture for people, uint8 (render_size, render_size, 3), from the agent's camera."""
+        """Return a picture for people, uint8 (render_size, render_size, 3), by the agent's camera.
+
+        Raises:
+            MerlError: the environment is closed.
+        """
         if self._physics is None:
-            raise MerlError("the environment is closed: make another one")
+            raise MerlError("the environment is closed: call reset() first")
         return None if self.render_mode is None else self._picture(self.config.render_size)
 
     def close(self) -> None:
-        """Let go of renderers and physics; may be called twice."""
+        """Free renderers and physics until the next `reset()`; may be called twice."""
         while self._renderers:
             self._renderers.popitem()[1].close()
         if self._physics is not None:
@@ -122,10 +121,21 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def physics(self) -> Any:
-        """The simulation (a dm_control `mjcf.Physics`), the same one as long as this is open."""
+        """The simulation, a dm_control `mjcf.Physics`; `reset()` after `close()` makes another.
+
+        Raises:
+            MerlError: the environment is closed.
+        """
         if self._physics is None:
-            raise MerlError("the environment is closed: make another one")
+            raise MerlError("the environment is closed: call reset() first")
         return self._physics
+
+    def _compile(self) -> Any:
+        """Compile the task's simulation."""
+        physics = self.task.compile()
+        buffer = physics.model.vis.global_  # OpenGL's, which has to hold every picture
+        buffer.offwidth = buffer.offheight = max(self.config.image_size, self.config.render_size)
+        return physics
 
     def action_for(self, velocities: NDArray[np.float64]) -> NDArray[np.float32]:
         """The action that asks for velocities of the joints: (9,), rad/s, to (9,), in [-1, 1]."""

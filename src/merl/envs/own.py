@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import sys
 import warnings
-from importlib import import_module
+from importlib.machinery import PathFinder
+from importlib.util import module_from_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,16 +18,26 @@ from gymnasium.envs.registration import registry
 
 from merl.core import MerlError, meant
 from merl.envs.adapted import adapt, failing, in_one_line
+from merl.envs.config import UserEnvConfig
+from merl.envs.packages import installing
 from merl.envs.registration import ENV_IDS
 
+BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
+"""Tasks in the form module:function that come with merl."""
+CLOSE = 0.8
+"""How similar an unknown id must be to a known one to be a mistyped form of it."""
 
-def make_own(task: str, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+
+def make_own(
+    task: str, render_mode: str | None = None, config: UserEnvConfig | None = None
+) -> gymnasium.Env[Any, Any]:
     """An environment that merl does not bring along, in the form that agents take.
 
     Args:
         task: a Gymnasium id (`Pendulum-v1`, `module:Id-v0`), or `module:function`, the function
             being called without arguments, or with `render_mode` if it knows that.
         render_mode: what is asked of it; where it cannot render, it is made without.
+        config: how its spaces are read.
 
     Returns:
         The environment, adapted (`Adapted`).
@@ -38,27 +50,106 @@ def make_own(task: str, render_mode: str | None = None) -> gymnasium.Env[Any, An
         env.close()
         env = _make(task, None)
     try:
-        return adapt(env)
+        return adapt(env, config)
     except BaseException:
         env.close()
         raise
 
 
+def imports_code(task: str) -> bool:
+    """Whether making a task's environment runs code that comes neither with merl nor Gymnasium."""
+    if task in ENV_IDS or task in BUNDLED:
+        return False
+    if ":" in task:
+        return True
+    spec = registry.get(task)  # an id that is not registered is refused before anything is imported
+    return spec is not None and not str(spec.entry_point).startswith("gymnasium.envs.")
+
+
 def module_folder(task: str) -> Path | None:
-    """Where Python found the module of `module:function` or `module:Id-v0`; None for a plain id."""
+    """The folder from which the module of `module:function` or `module:Id-v0` was loaded.
+
+    None for a Gymnasium id without a module, and for a module that is installed: Python finds it.
+    """
     module, colon, _ = task.partition(":")
-    loaded = sys.modules.get(module.partition(".")[0]) if colon else None
-    file = getattr(loaded, "__file__", None)
-    if file is None:
+    file = _file_of(module.partition(".")[0]) if colon else None
+    if file is None or {"site-packages", "dist-packages"} & {*file.parts}:
         return None
-    path = Path(file).resolve()
-    return path.parent.parent if path.name == "__init__.py" else path.parent
+    return file.parent.parent if file.name == "__init__.py" else file.parent
 
 
-def search_first(folder: Path) -> None:
-    """Have Python look for modules in this folder first, and then in the one where we are."""
-    if folder.is_dir():
-        sys.path[:0] = [str(folder), str(Path.cwd())]
+def load_module(task: str, *folders: Path) -> ModuleType:
+    """Import the module of `module:function` or `module:Id-v0`.
+
+    Args:
+        task: names the module.
+        folders: where the module is looked for first. The one that has it is appended to
+            `sys.path`, so that the module can import its neighbours, and everything else is found
+            where it was before.
+
+    Raises:
+        MerlError: there is no such module, or it cannot be imported.
+    """
+    module = task.partition(":")[0]
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise MerlError(f"task {task!r}: write it as my_robot:make_env, for my_robot.py here")
+    try:
+        if task not in BUNDLED:
+            any(_load_from(folder, module.partition(".")[0]) for folder in folders)
+        return importlib.import_module(module)
+    except MerlError:
+        raise
+    except ModuleNotFoundError as error:
+        if not f"{module}.".startswith(f"{error.name}."):
+            raise MerlError(
+                f"task {task!r}: {module!r} imports {error.name!r}, which is not installed here"
+            ) from None
+        places = " or ".join([*map(str, folders), "what is installed"])
+        way = installing(task.partition(":")[2], module)
+        way = way or "name its folder in PYTHONPATH, or call `merl train` where it lies"
+        raise MerlError(f"task {task!r}: {error} in {places}: {way}") from None
+    except Exception as error:
+        raise MerlError(
+            f"task {task!r}: importing {module!r} failed: {in_one_line(error)}"
+        ) from error
+
+
+def _load_from(folder: Path, name: str) -> bool:
+    """Load a top-level module or package from a folder, whatever is installed.
+
+    Returns:
+        Whether the folder has it.
+
+    Raises:
+        MerlError: another module of that name is loaded already.
+    """
+    importlib.invalidate_caches()
+    spec = PathFinder.find_spec(name, [str(folder)])
+    if spec is None:
+        return False
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+    if spec.loader is None or spec.origin is None:  # no __init__.py: what is installed comes first
+        return False
+    if name not in sys.modules:
+        module = sys.modules[name] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            sys.modules.pop(name, None)
+            raise
+    elif _file_of(name) != Path(spec.origin).resolve():
+        raise MerlError(
+            f"{spec.origin} cannot be imported: {name!r} is the name of another module, "
+            f"{_file_of(name) or 'of Python itself'}; rename it"
+        )
+    return True
+
+
+def _file_of(name: str) -> Path | None:
+    """The file of a module that is loaded."""
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return None if file is None else Path(file).resolve()
 
 
 def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
@@ -69,47 +160,25 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
         raise MerlError(f"task {task!r} is merl's own: call it {known}")
     if not colon:
         if task not in registry:
-            way = meant(task, [*ENV_IDS, *registry])
-            if not way.startswith("did"):
+            way = installing(task) or meant(task, [*ENV_IDS, *registry], CLOSE)
+            if not way.startswith(("did", "it comes")):
                 way = f"choose from {', '.join(ENV_IDS)}, or name a Gymnasium id or module:function"
             raise MerlError(f"task {task!r} is unknown: {way}")
         return _by_id(task, render_mode)
-    found = _imported(task, module)
+    found = load_module(task)
     make = getattr(found, name, None)
     if make is None:
         if name in registry:
             return _by_id(name, render_mode)
+        way = meant(name, registry, CLOSE)
         raise MerlError(
             f"task {task!r}: module {module!r} has no function {name!r}, and registers no "
-            "environment of that name"
+            f"environment of that name{f': {way}' if way.startswith('did') else ''}"
         )
     env = _called(task, make, render_mode)
     if not isinstance(env, gymnasium.Env):
         raise MerlError(f"task {task!r} gave {type(env).__name__}, not a gymnasium.Env")
     return env
-
-
-def _imported(task: str, module: str) -> ModuleType:
-    """The module, from the folder where we are before any other, as `python` would."""
-    if not all(part.isidentifier() for part in module.split(".")):
-        raise MerlError(f"task {task!r}: write it as my_robot:make_env, for my_robot.py here")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.insert(0, here)
-    try:
-        return import_module(module)
-    except ModuleNotFoundError as error:
-        if not f"{module}.".startswith(f"{error.name}."):
-            raise MerlError(
-                f"task {task!r}: {module!r} imports {error.name!r}, which is not installed here"
-            ) from None
-        raise MerlError(
-            f"task {task!r}: {error}: call merl where it lies, or name its folder in PYTHONPATH"
-        ) from None
-    except Exception as error:
-        raise MerlError(
-            f"task {task!r}: importing {module!r} failed: {in_one_line(error)}"
-        ) from error
 
 
 def _called(task: str, make: Any, render_mode: str | None) -> Any:

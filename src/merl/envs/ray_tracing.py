@@ -7,6 +7,7 @@ import os
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -138,18 +139,26 @@ def start_warp() -> Any:
 
 
 @contextmanager
-def told_if_it_takes_long(seconds: float = 2.0) -> Iterator[None]:
-    """Say that the renderer is being compiled; loading what is compiled takes less time."""
-    notice = threading.Timer(
-        seconds,
-        lambda: print("merl: compiling the renderer, once, for 5 to 20 s", file=sys.stderr),
-    )
-    notice.daemon = True
-    notice.start()
+def told_if_it_takes_long(seconds: float = 2.0) -> Iterator[threading.Thread]:
+    """Say that the renderer is being compiled, if this takes more than `seconds`.
+
+    They are seconds of processor time: to load what is compiled already takes fewer, also on a busy
+    machine.
+    """
+    begin, is_over = time.process_time(), threading.Event()
+
+    def watch() -> None:
+        while not is_over.wait(0.1):
+            if time.process_time() - begin > seconds:
+                print("merl: compiling the renderer, once, for 5 to 20 s", file=sys.stderr)
+                return
+
+    watching = threading.Thread(target=watch, daemon=True)
+    watching.start()
     try:
-        yield
+        yield watching
     finally:
-        notice.cancel()
+        is_over.set()
 
 
 def _kernel_cache() -> Path:

@@ -1,8 +1,9 @@
-"""Pictures of the scene: two renderers behind one protocol.
+"""Pictures of the scene: three renderers behind one protocol.
 
-`gl` draws as dm_control does, pixel for pixel. `warp` traces rays on the CPU with mujoco-warp and
-needs no OpenGL library; it draws neither sites nor transparency nor reflections, and does not
-smooth edges. To an agent the two are different cameras.
+`gl` draws as dm_control does, pixel for pixel. `warp` traces rays on the CPU with mujoco-warp,
+`raster` draws triangles with Warp kernels of merl's own; both need no OpenGL library, draw neither
+sites nor transparency nor reflections, and do not smooth edges (`RasterRenderer` can, on request).
+To an agent they are different cameras.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.envs.config import RendererName
+from merl.envs.config import RendererChoice
 from merl.envs.opengl import GlRenderer, enable_opengl
+from merl.envs.raster.renderer import RasterRenderer
 from merl.envs.ray_tracing import WarpRenderer
 
 
@@ -31,23 +33,27 @@ class Renderer(Protocol):
         ...
 
 
-def make_renderer(name: RendererName, physics: Any, camera: str, size: int) -> Renderer:
-    """A renderer by its name.
+def make_renderer(name: RendererChoice, physics: Any, camera: str, size: int) -> Renderer:
+    """Make a renderer by its name.
 
     Args:
-        name: `gl` or `warp`.
+        name: `gl`, `raster` or `warp`; `EnvConfig` has replaced `auto`.
         physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
         camera: the name of a camera in the model.
         size: height and width of the pictures, in pixels.
 
     Raises:
-        MerlError: `gl`, and no OpenGL library works.
+        MerlError: `gl`, and no OpenGL library works; `raster`, and a geom cannot be drawn.
     """
-    renderers: dict[RendererName, type[Renderer]] = {"gl": GlRenderer, "warp": WarpRenderer}
+    renderers: dict[str, type[Renderer]] = {
+        "gl": GlRenderer,
+        "raster": RasterRenderer,
+        "warp": WarpRenderer,
+    }
     return renderers[name](physics, camera, size)
 
 
-def check_renderer(name: RendererName) -> None:
+def check_renderer(name: RendererChoice) -> None:
     """Make sure that a renderer works here, before anything is built on it.
 
     Raises:

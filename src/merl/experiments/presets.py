@@ -12,6 +12,7 @@ import tyro
 from merl.agents import AGENTS
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
+from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 from merl.training.config import EvaluationConfig, Setting, TrainConfig
 
@@ -38,7 +39,7 @@ class Preset:
 PRESETS: dict[str, Preset] = {
     "paper": Preset(
         "Table 1, OpenGL pictures: for a machine with CUDA",
-        TrainConfig(_TASK),
+        TrainConfig(_TASK, env=EnvConfig(renderer="gl")),
     ),
     "laptop": Preset(
         "made for 2 cores without a GPU: learns in about an hour",  # docs/laptop.md
@@ -159,6 +160,9 @@ def compose(
     check_choice("agent", name, tuple(AGENTS))
     check_choice("setting", setting, get_args(Setting))
     config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
+    if not config.own_env:  # a user's environment may be a robot, which nothing moves unasked
+        evaluation = dataclasses.replace(config.eval, references=True)
+        config = dataclasses.replace(config, eval=evaluation)
     values = dict(chosen.agent)
     base = AGENTS[name]
     if preset == "paper" and base.head_norm:
@@ -175,5 +179,7 @@ def compose(
         replay = dataclasses.replace(config.replay, **theirs.replay)
         config = dataclasses.replace(config, replay=replay, **theirs.run)
         values = dict(theirs.agent)
+    if base.vectors and task not in ENV_IDS:  # `state` is a name of merl's own tasks
+        values["vectors"] = None
     made = dataclasses.replace(base, **values)
     return dataclasses.replace(config, agent_name=name, agent=made)

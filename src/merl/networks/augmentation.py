@@ -87,14 +87,22 @@ def _shift_by_index(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
     return gathered.permute(0, 3, 1, 2, 4)
 
 
-def to_input(images: Tensor, dtype: torch.dtype) -> Tensor:
-    """Stacked bytes (B, K, H, W, C) to what a convolution reads: (B, K C, H, W), x - 128.
+def to_input(images: Tensor, dtype: torch.dtype, middle: int = 128) -> Tensor:
+    """Stacked bytes (B, K, H, W, C) to what a convolution reads: (B, K C, H, W), x - middle.
 
     These whole numbers are exact in bf16, which x / 255 - 0.5 is not; the scale is left to the
     weights (`encoders.ConvEncoder`). The memory is in channels-last order, which convolutions are
     fastest with.
+
+    Args:
+        images: uint8.
+        dtype: of the result.
+        middle: what is subtracted.
     """
-    return _centred(images).view(torch.int8).flatten(3).to(dtype).permute(0, 3, 1, 2)
+    pixels = _centred(images).view(torch.int8).flatten(3).to(dtype)
+    if middle != 128:
+        pixels = pixels + (128 - middle)
+    return pixels.permute(0, 3, 1, 2)
 
 
 def _centred(images: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ class ConvEncoder(nn.Module):
         image_size: (H, W) of a frame, in pixels.
         channels: channels of each convolution.
         strides: one stride per convolution; the paper's are 2, 1, 1, 1.
+        pixels: the lowest and the highest pixel, which are scaled to -0.5 and 0.5.
 
     Attributes:
         features: length of the flat output.
@@ -34,8 +35,10 @@ class ConvEncoder(nn.Module):
         image_size: tuple[int, int],
         channels: int = 32,
         strides: Sequence[int] = (2, 1, 1, 1),
+        pixels: tuple[int, int] = (0, 255),
     ) -> None:
         super().__init__()
+        self._low, self._high = pixels
         layers: list[nn.Module] = []
         height, width = image_size
         for index, stride in enumerate(strides):
@@ -60,10 +63,13 @@ class ConvEncoder(nn.Module):
         assert isinstance(first, nn.Conv2d)
         assert first.bias is not None
         # x / 255 - 0.5 = (x - 128) / 255 + 1 / 510, which its weights and bias take in: a few
-        # numbers are multiplied in place of all pixels.
-        weight = first.weight / 255.0
-        bias = first.bias + first.weight.sum(dim=(1, 2, 3)) / 510.0
-        pixels = to_input(stacks, compute_dtype(first.weight))
+        # numbers are multiplied in place of all pixels. Other bounds likewise, about their middle.
+        span = float(self._high - self._low)
+        middle = (self._low + self._high + 1) // 2
+        weight, bias = first.weight / span, first.bias
+        if 2 * middle != self._low + self._high:  # an odd sum: the middle is half a pixel too high
+            bias = bias + first.weight.sum(dim=(1, 2, 3)) / (2.0 * span)
+        pixels = to_input(stacks, compute_dtype(first.weight), middle)
         maps = functional.conv2d(pixels, weight, bias, first.stride)  # (B, 32, h, w)
         for layer in others:
             maps = layer(maps)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import gymnasium
 
-from merl.core import MerlError
+from merl.core import MerlError, counted
 from merl.replay.compression import SLOTS_OF_ANY_PICTURE
 from merl.replay.storage import fields_of
 from merl.resources import available_memory, existing_parent, free_disk
@@ -51,8 +51,8 @@ class ReplayConfig:
             raise MerlError(f"replay.discount is {self.discount}: give a number from 0 to 1")
         if self.batch_size > self.capacity:
             raise MerlError(
-                f"replay.batch-size {self.batch_size} is larger than the replay of {self.capacity} "
-                f"steps: give at most {self.capacity}, or more steps"
+                f"replay.batch-size {self.batch_size} is larger than the replay of "
+                f"{counted(self.capacity, 'step')}: give at most {self.capacity}, or more steps"
             )
 
 
@@ -154,6 +154,6 @@ def _too_large(
     if small < need and small <= room:
         way_out = f"--replay.compress brings it to {small / 1e9:.3g} GB, or {way_out}"
     return MerlError(
-        f"a replay of {capacity:,} steps needs {need / 1e9:.3g} GB, but {room / 1e9:.3g} GB "
-        f"{what}: {way_out}"
+        f"a replay of {counted(capacity, 'step')} needs {need / 1e9:.3g} GB, but "
+        f"{room / 1e9:.3g} GB {what}: {way_out}"
     )

@@ -264,19 +264,32 @@ class Replay:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go back to what `state_dict` said; what was written since then is forgotten.
 
-        What was overwritten since then is put back, if that was the last state to be settled; of
-        an older one, moments that a ring has overwritten which has wrapped are gone.
+        What was overwritten since then is put back, if that was the last state to be settled. If
+        the moment of the state itself is overwritten and cannot be put back (the disk was full, or
+        the state is an older one), the ring stays as it is, which is a warning: the steps that it
+        holds are the run's as well.
 
         Raises:
-            MerlError: the ring does not hold what the state names.
+            MerlError: the ring does not hold what the state names, and nothing newer.
         """
         moments = int(state["moments"])
         journal = self._journal
         there = moments == 0 or self._data["moment"][self._slot(moments)] == moments
         if not there and (journal is None or not journal.holds(moments)):
+            if self._moments > moments:
+                _LOG.warning(
+                    "the replay has overwritten what it held at the checkpoint, and keeps the %s "
+                    "newer steps that it has: training continues, but not bit for bit as before",
+                    f"{len(self):,}",
+                )
+                if journal is not None:
+                    journal.empty()
+                self._take_over(self._moments)
+                self._settled = 0
+                return
             raise MerlError(
                 f"the replay does not hold moment {moments:,}, at which the checkpoint was taken: "
-                "it is not this run's, or was written to since; start a new run"
+                "it is not this run's; start a new run"
             )
         for name, starts in state.get("starts", {}).items():
             self._compressed[name].backgrounds.go_back(int(starts))

@@ -15,6 +15,11 @@ from typing import Any
 from merl.envs.config import EnvConfig
 from merl.statistics import Interval
 
+RANDOM = "random actions"
+"""The reference that acts at random."""
+EXPERT = "scripted expert"
+"""The reference that solves the task with the simulator's state."""
+
 
 @dataclass(frozen=True)
 class Reference:

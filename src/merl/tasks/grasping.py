@@ -11,8 +11,8 @@ from merl.tasks.kinematics import Array, Kinematics, Path, Pose
 
 OPEN = np.full(3, 0.45)
 """Angles of the fingers around a box, rad."""
-CLOSING = np.array([[0.7] * 3, [1.0] * 3])
-"""While and after they close, rad."""
+CLOSING = tuple(np.full(3, angle) for angle in (0.6, 0.7, 0.8, 0.9, 1.0))
+"""While and after they close, rad: their tips are lowest between 0.6 and 0.9."""
 TILTS = tuple(np.radians([0, 20, 30, 40, 45, 50, 55, 60, 65, 70]))
 """Of the hand against straight down, rad: the larger, the further it gets under something."""
 GRIPS = ((0.0, 0.0), (0.0, 0.006), (0.006, 0.006), (0.006, 0.0))
@@ -22,7 +22,7 @@ FINGERS_MIDDLE = -0.011
 STRAIGHT = 0.2
 """How far the hand goes at most straight to a box, and straight back with it, m."""
 STRAIGHT_STEPS = 2
-"""Of the approach at least: `LINE_STEP` each."""
+"""Of the approach at least, where there is room: `LINE_STEP` each."""
 TOP = 0.36
 """Up to here the hand may rise on its way, m."""
 UNREACHED = 10.0
@@ -32,9 +32,16 @@ TURNS = tuple(np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 18
 OFF_CENTRE = 100.0
 """What a metre off the middle of the box costs, s/m: the grip is less sure."""
 BRIDGES = 80
-"""So many connections, the fastest first, are looked at for collisions."""
+"""Number of direct connections, the fastest first, that are checked for collisions."""
+DETOURS = 400
+"""Number of connections over one random pose that are checked where no direct one is free."""
+DETOUR_SPREAD = 0.5
+"""Standard deviation of that pose around the direct connection, rad."""
 TRIED = 2
-"""Of the grasps, the most promising first, so many are worked out before the fastest is taken."""
+"""At least this many grasps, the most promising first, are planned before the fastest is taken."""
+FAST = 5.0
+"""As long as the fastest plan takes longer, the other grasps are planned too: an episode has 10 s
+and the box must be set down in it, s."""
 
 
 def hand_rotation(azimuth: float, tilt: float, roll: float = 1.0) -> Array:
@@ -89,9 +96,13 @@ def find_approach(
         carry = find_carry(arm, at, arm.pose(at).relative(box), goal, upright)
         if carry is not None:
             found.append((arm.seconds(approach) + arm.seconds(carry), approach))
-        if len(found) == TRIED:
+        if len(found) >= TRIED and min(found, key=_seconds)[0] <= FAST:
             break
-    return min(found, key=lambda item: item[0])[1] if found else None
+    return min(found, key=_seconds)[1] if found else None
+
+
+def _seconds(plan: tuple[float, Path]) -> float:
+    return plan[0]
 
 
 def _reachable(
@@ -155,27 +166,50 @@ def find_carry(arm: Kinematics, q: Array, held: Pose, goal: Array, upright: bool
 def _connected(
     arm: Kinematics, starts: list[Path], ends: list[Path], held: Pose | None = None
 ) -> Path | None:
-    """The fastest path along one of `starts`, straight over to one of `ends`, and back along it."""
+    """Return the fastest free path along one of `starts`, over to one of `ends`, and back along it.
+
+    It goes over straight or, where that is not free, by way of one other pose of the arm.
+    """
     if not starts or not ends:
         return None
     here, there = (np.array([path[-1] for path in paths]) for paths in (starts, ends))
-    costs = arm.durations(here[:, None] - there)  # (starts, ends)
-    costs += np.array([arm.seconds(path) for path in starts])[:, None]
-    costs += np.array([arm.seconds(path) for path in ends])
-    for index in np.argsort(costs, axis=None, kind="stable")[:BRIDGES]:
-        start, end = starts[index // len(ends)], ends[index % len(ends)]
-        path = [*start, *end[::-1]]
-        if not arm.is_free([start[-1], end[-1]], held):
-            continue
-        if arm.is_free(list(arm.timed(path)[::3]), held):  # its corners are rounded
+    along = np.array([arm.seconds(path) for path in starts])[:, None]
+    along = along + np.array([arm.seconds(path) for path in ends])  # (starts, ends)
+    direct = along + arm.durations(here[:, None] - there)
+    for index in np.argsort(direct, axis=None, kind="stable")[:BRIDGES]:
+        path = _joined(arm, starts[index // len(ends)], [], ends[index % len(ends)], held)
+        if path is not None:
+            return path
+    rng = np.random.default_rng(0)  # the same scene gives the same path
+    start, end = rng.integers(len(starts), size=DETOURS), rng.integers(len(ends), size=DETOURS)
+    by_way_of = here[start] + rng.random((DETOURS, 1)) * (there[end] - here[start])
+    by_way_of = arm.within_limits(by_way_of + rng.normal(0.0, DETOUR_SPREAD, by_way_of.shape))
+    costs = arm.durations(here[start] - by_way_of) + arm.durations(by_way_of - there[end])
+    for i in np.argsort(costs + along[start, end], kind="stable"):
+        path = _joined(arm, starts[start[i]], [by_way_of[i]], ends[end[i]], held)
+        if path is not None:
             return path
     return None
 
 
+def _joined(
+    arm: Kinematics, start: Path, middle: Path, end: Path, held: Pose | None
+) -> Path | None:
+    """Join a path, poses between, and another path backwards; None unless all of it is free."""
+    path = [*start, *middle, *end[::-1]]
+    if not arm.is_free([start[-1], *middle, end[-1]], held, lifted=True):
+        return None
+    corners_rounded = list(arm.timed(path)[::3])
+    return path if arm.is_free(corners_rounded, held) else None
+
+
 def _ways_off(arm: Kinematics, q: Array, held: Pose | None, least: int) -> list[Path]:
-    """At least so many steps straight back from where the hand points, then straight up."""
+    """Return paths that go straight back from where the hand points, then straight up.
+
+    They go back by `least` steps or more, or as far as there is room.
+    """
     line = arm.line(q, -STRAIGHT * arm.pose(q).rotation[:, 2], held)
-    backs = [line[: i + 1] for i in range(least, len(line))]
+    backs = [line[: i + 1] for i in range(min(least, len(line) - 1), len(line))]
     return [rise for back in backs for rise in _rises(arm, back, held)]
 
 

@@ -24,9 +24,13 @@ Path = list[Array]
 CLEARANCE = 0.004
 """What is nearer than this touches, m: the arm strays a little from its plan."""
 SCENE_CLEARANCE = 0.006
-"""The same for what is fixed, but for the floor, which may be near but not be touched, m."""
+"""The robot's distance from what is fixed, the floor excepted, m."""
+HELD_CLEARANCE = 0.015
+"""The same for a held object, which moves in the grip and lags behind with the hand, m."""
 SUNK = 5e-4
-"""What lies on the floor sinks into it by less, m."""
+"""The resting object sinks into the floor by less than this, m."""
+FLOOR_CLEARANCE = 1e-3
+"""The robot keeps this distance from the floor, m: a finger that scrapes over it does not close."""
 DAMPING = 0.02
 """Of the least squares, m: bounds the step near singular poses."""
 LEVER = 0.15
@@ -91,7 +95,7 @@ class Kinematics:
     def __init__(self, task: JacoTask, physics: mjcf.Physics) -> None:
         model: Any = copy.copy(physics.model.ptr)
         model.geom_margin[:] = CLEARANCE
-        model.geom_margin[model.geom_bodyid == 0] = SCENE_CLEARANCE
+        model.geom_margin[model.geom_bodyid == 0] = HELD_CLEARANCE
         self._model, self._data = model, mujoco.MjData(model)
         joints = physics.bind(task.arm.joints).element_id
         fingers = physics.bind(task.hand.joints).element_id
@@ -105,6 +109,7 @@ class Kinematics:
         self._low, self._high = np.where(self._turns_freely, unlimited, model.jnt_range[joints].T)
         self.max_velocity: Array = model.actuator_ctrlrange[: len(joints), 1].copy()
         self._is_floor = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        self._is_scene = (model.geom_bodyid == 0) & ~self._is_floor
         self._is_robot, self._is_prop = np.zeros((2, model.ngeom), dtype=bool)
         self._is_robot[physics.bind(task.arm.mjcf_model.find_all("geom")).element_id] = True
         self._is_prop[physics.bind(task.prop.mjcf_model.find_all("geom")).element_id] = True
@@ -164,6 +169,11 @@ class Kinematics:
             q = np.clip(q + change, self._low, self._high)
         return None
 
+    def within_limits(self, q: Array) -> Array:
+        """Return joint angles (..., 6), rad, brought within the joints' limits."""
+        limited: Array = np.clip(q, self._low, self._high)
+        return limited
+
     def line(self, q: Array, offset: Array, held: Pose | None = None) -> Path:
         """Move the hand straight by (3,), m, without turning it, as far as it can and is free.
 
@@ -184,22 +194,23 @@ class Kinematics:
             path.append(found)
         return path
 
-    def is_free(self, path: Path, held: Pose | None = None) -> bool:
-        """Whether the arm touches nothing along a path, its start aside.
+    def is_free(self, path: Path, held: Pose | None = None, *, lifted: bool = False) -> bool:
+        """Return whether the arm touches nothing along a path, its start excepted.
 
         Args:
-            path: of at least one q; of a single one, that one is looked at.
-            held: the object's pose in the hand's frame; it moves along and may touch the hand.
-                None where it stays where it is.
+            path: at least one q; a single q is checked itself.
+            held: pose of a held object in the hand's frame: it moves with the hand and may touch
+                it. None: the object stays where it is.
+            lifted: the held object must also keep its distance from the floor.
         """
         for a, b in zip(path, path[1:] or path, strict=False):
             count = max(int(np.ceil(np.abs(b - a).max() / CHECK_STEP)), 1)
             for i in range(1, count + 1):
-                if self._touches(a + (b - a) * i / count, held):
+                if self._touches(a + (b - a) * i / count, held, lifted):
                     return False
         return True
 
-    def _touches(self, q: Array, held: Pose | None) -> bool:
+    def _touches(self, q: Array, held: Pose | None, lifted: bool) -> bool:
         prop = self._data.qpos[self._prop_qpos]
         prop[:] = self._resting
         hand = self.pose(q)
@@ -211,8 +222,13 @@ class Kinematics:
         contact = self._data.contact
         pairs = contact.geom  # (contacts, 2)
         robot, moved = self._is_robot[pairs].any(axis=1), self._is_prop[pairs].any(axis=1)
-        deep = (contact.dist < -SUNK) | ~self._is_floor[pairs].any(axis=1)
-        return bool((deep & (robot if held is None else robot != moved)).any())
+        clearance = np.full(len(pairs), CLEARANCE)
+        scene, floor = (fixed[pairs].any(axis=1) for fixed in (self._is_scene, self._is_floor))
+        clearance[scene] = np.where(moved, HELD_CLEARANCE, SCENE_CLEARANCE)[scene]
+        on_floor = SCENE_CLEARANCE if lifted else -SUNK
+        clearance[floor] = np.where(moved, on_floor, FLOOR_CLEARANCE)[floor]
+        close = contact.dist < clearance
+        return bool((close & (robot if held is None else robot != moved)).any())
 
     def seconds(self, path: Path) -> float:
         """How long a path takes at full speed."""

@@ -14,7 +14,7 @@ TARGET_OVER_DISC = (0.0, 0.0, 0.22)
 DISC_RADIUS = 0.075
 """Of the disc that hides the box when `occluded`, m."""
 VERTICAL_COSINE_AROUND_DISC = 0.40
-"""From which on the hand counts as vertical when `occluded`: it has to tilt to get under."""
+"""Bound and margin of the vertical term when `occluded`: the hand has to tilt to get under."""
 
 
 class LiftBox(BoxTask):

@@ -26,9 +26,8 @@ SUCCESS_MARGIN = 0.01
 FAR_GOAL_MARGIN = 0.3
 """Margin of the reward `far`: a straight line, to 0 after this margin, m."""
 VERTICAL_COSINE = 0.99
-"""1 - epsilon_vertical: the hand points down when the cosine of its tilt is at least this."""
-VERTICAL_MARGIN = 0.99
-"""Below it the reward falls off as a gaussian of this width, in units of the cosine."""
+"""1 - epsilon_vertical: the hand points down when the cosine of its tilt is at least this; below it
+the reward falls off as a gaussian whose margin is the same number."""
 FLOATING_HEIGHT = 0.035
 """epsilon_floating: the object is off the floor when its centre is above this, m."""
 
@@ -105,7 +104,7 @@ def lift(
         height: of the object's centre above the floor, m.
         target_height: of the target above the floor, m, above 0.
         goal_distance: from the object to its target, m.
-        vertical_cosine: 1 - epsilon_vertical, from which on the hand counts as vertical.
+        vertical_cosine: 1 - epsilon_vertical: bound and margin of the vertical term.
         form: which reward.
 
     Returns:
@@ -160,4 +159,4 @@ def _solved(distance: float) -> float:
 
 def _upright(cosine: float, enough: float) -> float:
     bounds = (enough, float("inf"))  # a cosine may exceed 1 by a rounding error
-    return float(tolerance(cosine, bounds, margin=VERTICAL_MARGIN, sigmoid="gaussian"))
+    return float(tolerance(cosine, bounds, margin=enough, sigmoid="gaussian"))

@@ -7,12 +7,14 @@ environments in processes of their own step while the learner learns.
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from threading import Timer
 from typing import Any, NamedTuple, Protocol
 
@@ -22,9 +24,17 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.async_vector_env import AsyncState
 from numpy.typing import NDArray
 
-from merl.core import EnvironmentsLost, MerlError, Observation
+from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
+from merl.envs.own import load_module, module_folder
 from merl.training.config import TrainConfig
-from merl.training.environment import environment_state, make_run_env, set_environment_state
+from merl.training.environment import (
+    EnvSpaces,
+    environment_state,
+    make_run_env,
+    set_environment_state,
+)
+from merl.training.generators import seed_global_generators
+from merl.training.output import tolerate_lost_output
 
 _INFO = ("success", "reward_terms")
 """What the loop wants to know beside the reward."""
@@ -33,7 +43,8 @@ _TOLD = "told"
 _LEFT_TO_THE_RUN = (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
 """A terminal or a batch system sends them to the workers too, which are to work on until the run
 has saved and ends them. SIGTERM is what they are ended by."""
-
+_SAFE_PATH = "PYTHONSAFEPATH"
+"""With it Python leaves the working folder out of `sys.path`."""
 
 START_SECONDS = 300.0
 """In which all processes must have made their environments."""
@@ -69,6 +80,8 @@ class Environments(Protocol):
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
         """Start an episode in each environment named, with its seed if it has one.
 
+        A seed also seeds the global generators of the process that the environment lives in.
+
         Raises:
             Lost: a process died.
         """
@@ -90,8 +103,8 @@ class Environments(Protocol):
         """
         ...
 
-    def states(self) -> list[dict[str, Any] | None]:
-        """Where each one's random numbers stand, as plain types; None if it does not tell."""
+    def states(self) -> list[dict[str, Any]]:
+        """Return `environment_state()` of each one."""
         ...
 
     def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
@@ -127,7 +140,12 @@ class Here:
 
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
         """See `Environments`."""
-        return {index: self._env.reset(seed=seed)[0] for index, seed in seeds.items()}
+        observations = {}
+        for index, seed in seeds.items():
+            if seed is not None:
+                seed_global_generators(seed)
+            observations[index] = self._env.reset(seed=seed)[0]
+        return observations
 
     def send(self, actions: NDArray[np.float32]) -> None:
         """See `Environments`."""
@@ -138,7 +156,7 @@ class Here:
         observation, reward, terminated, truncated, info = self._env.step(self._action)
         return [Step(observation, float(reward), terminated, truncated, info)]
 
-    def states(self) -> list[dict[str, Any] | None]:
+    def states(self) -> list[dict[str, Any]]:
         """See `Environments`."""
         return [environment_state(self._env)]
 
@@ -209,7 +227,7 @@ class Workers:
             for index in range(self.count)
         ]
 
-    def states(self) -> list[dict[str, Any] | None]:
+    def states(self) -> list[dict[str, Any]]:
         """See `Environments`."""
         return [*self._call("state")]
 
@@ -250,13 +268,18 @@ class Workers:
 
     def _started(self) -> AsyncVectorEnv:
         self._lost = None
-        makers = [_Maker(self._config, index, self._here) for index in range(self.count)]
+        expected = EnvSpaces.of(self._config, self._here)
+        folder = module_folder(self._config.task)
+        makers = [
+            _Maker(self._config, index, expected, self._here, folder) for index in range(self.count)
+        ]
         others = multiprocessing.active_children()
         with (
             self._loss(),
             _killing_after(
                 START_SECONDS, lambda: set(multiprocessing.active_children()) - {*others}
             ),
+            _without_the_working_folder(),
         ):
             # What a worker raises is raised here; Gymnasium would print it, too.
             gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
@@ -275,6 +298,27 @@ def _killing_after(
         yield
     finally:
         impatience.cancel()
+
+
+@contextmanager
+def _without_the_working_folder() -> Iterator[None]:
+    """Start Python processes that do not look for modules in the working folder.
+
+    They are started by `python -c`, which searches it before the standard library.
+    """
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        _set_environment(_SAFE_PATH, before)
+
+
+def _set_environment(name: str, value: str | None) -> None:
+    if value is None:
+        os.environ.pop(name, None)
+    else:
+        os.environ[name] = value
 
 
 def _kill(processes: Iterable[BaseProcess]) -> None:
@@ -320,6 +364,8 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._index = index
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        if options.get("seed") is not None:
+            seed_global_generators(options["seed"])
         with _errors_that_arrive():
             observation, _ = self.env.reset(**options)
         return observation, {}
@@ -331,7 +377,7 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
         # In a tuple, lest Gymnasium merge it with what the other environments tell.
         return observation, reward, terminated, truncated, {_TOLD: (told,)}
 
-    def state(self) -> dict[str, Any] | None:
+    def state(self) -> dict[str, Any]:
         with _errors_that_arrive():
             return environment_state(self.env)
 
@@ -340,11 +386,23 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
             set_environment_state(self.env, states[self._index])
 
 
-class _Lent(gymnasium.Env[Any, Any]):
-    """The spaces of an environment, for who wants to make one only to look at it."""
+class _StandIn(gymnasium.Env[Any, Any]):
+    """Has the spaces of an environment, and nothing else.
 
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        self.observation_space, self.action_space = env.observation_space, env.action_space
+    Args:
+        expected: its spaces.
+        error: why the environment cannot be used; `reset` raises it, since an exception while a
+            worker starts does not reach the run.
+    """
+
+    def __init__(self, expected: EnvSpaces, error: MerlError | None = None) -> None:
+        self.observation_space, self.action_space = expected.observation, expected.action
+        self._error = error
+
+    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+        if self._error is not None:
+            raise self._error
+        raise NotImplementedError
 
 
 @dataclass
@@ -353,15 +411,30 @@ class _Maker:
 
     config: TrainConfig
     index: int
+    expected: EnvSpaces
     here: gymnasium.Env[Any, Any] | None
+    folder: Path | None
+    """From which the module of a user's environment was loaded."""
+    safe_path: str | None = field(default_factory=lambda: os.environ.get(_SAFE_PATH))
+    """What the user set; the environment may start Python processes of its own."""
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
         if self.here is not None:
-            return _Lent(self.here)
+            return _StandIn(self.expected)
         for number in _LEFT_TO_THE_RUN:
             signal.signal(number, signal.SIG_IGN)
+        _set_environment(_SAFE_PATH, self.safe_path)
+        tolerate_lost_output()
         with _errors_that_arrive():
-            return _Worker(make_run_env(self.config), self.index)
+            if self.folder is not None:
+                load_module(self.config.task, self.folder)
+            env = make_run_env(self.config)
+        try:
+            self.expected.check(EnvSpaces.of(self.config, env), f"that of worker {self.index}")
+        except MerlError as error:
+            env.close()
+            env = _StandIn(self.expected, EnvironmentFailed(str(error)))
+        return _Worker(env, self.index)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"config": self.config, "index": self.index, "here": None}
+        return {**vars(self), "here": None}

@@ -13,8 +13,8 @@ import io
 import json
 import logging
 import os
-import pickle
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +28,7 @@ from safetensors.torch import save as to_bytes
 from torch import nn
 
 from merl.core import Agent, MerlError
+from merl.networks.settings import torch_settings
 from merl.training.guards import check_weights
 
 FORMAT = 1
@@ -38,6 +39,7 @@ _WEIGHTS, _LEARNER, _STATE, _MANIFEST = (
     "manifest.json",
 )
 _WEIGHT_GROUPS = ("networks", "critic_target")
+_CPU = torch.device("cpu")
 _LOG = logging.getLogger(__name__)
 
 
@@ -135,14 +137,16 @@ def save(
         OSError: it could not be written; the former ones are untouched.
         NotFinite: a weight is a NaN or an infinity; so are they then.
     """
-    learnt = agent.state_dict()
-    check_weights({group: learnt[group] for group in _WEIGHT_GROUPS})
+    with torch_settings(_CPU):
+        learnt = agent.state_dict()
+        check_weights({group: learnt[group] for group in _WEIGHT_GROUPS})
     root.mkdir(exist_ok=True)  # no parents: a run's folder that was taken away stays away
     part = root / f".part-{step:08d}"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
-        _write(part, learnt, state)
+        with torch_settings(_CPU):
+            _write(part, learnt, state)
         names = (_WEIGHTS, _LEARNER, _STATE)
         manifest = {
             "format": FORMAT,
@@ -177,8 +181,8 @@ def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
     Raises:
         MerlError: a file cannot be read, or belongs to other networks.
     """
-    with _readable(checkpoint):
-        learner = torch.load(checkpoint.path / _LEARNER, map_location="cpu", weights_only=True)
+    with _readable(checkpoint), torch_settings(_CPU):
+        learner = _learner(checkpoint)
         agent.load_state_dict({**_weights(checkpoint), **learner})
 
 
@@ -188,7 +192,7 @@ def load_networks(networks: nn.Module, checkpoint: Checkpoint) -> None:
     Raises:
         MerlError: a file cannot be read, or belongs to other networks.
     """
-    with _readable(checkpoint):
+    with _readable(checkpoint), torch_settings(_CPU):
         networks.load_state_dict(_weights(checkpoint)["networks"])
 
 
@@ -197,16 +201,41 @@ def _readable(checkpoint: Checkpoint) -> Iterator[None]:
     """What goes wrong in reading, in one line."""
     try:
         yield
+    except MerlError:
+        raise
     except (
         OSError,
         RuntimeError,
         ValueError,
         KeyError,
+        TypeError,
+        AttributeError,
         SafetensorError,
-        pickle.UnpicklingError,
     ) as error:
         why = " ".join(line.strip() for line in str(error).strip().split("\n")[:2])
         raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {why}") from None
+
+
+def _learner(checkpoint: Checkpoint) -> dict[str, Any]:
+    """Optimizers and generators: tensors and plain values only, nothing is unpickled.
+
+    Raises:
+        MerlError: the file holds something else. torch would advise to unpickle it all the same.
+    """
+    path = checkpoint.path / _LEARNER
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            learner = torch.load(path, map_location="cpu", weights_only=True)
+        if isinstance(learner, dict):
+            return learner
+    except OSError:
+        raise
+    except Exception:
+        pass
+    raise MerlError(
+        f"checkpoint {checkpoint.path} cannot be loaded: {_LEARNER} holds something else than the "
+        "tensors and plain values that merl writes; loading that could run code"
+    )
 
 
 def _weights(checkpoint: Checkpoint) -> dict[str, dict[str, torch.Tensor]]:

@@ -11,8 +11,8 @@ import tyro
 
 from merl.agents import AGENTS
 from merl.agents.config import AgentConfig
-from merl.core import MerlError, check_choice
-from merl.envs.config import EnvConfig
+from merl.core import MerlError, check_choice, counted
+from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 
@@ -29,19 +29,28 @@ class EvaluationConfig:
     """How often the agent shows what it has learnt: without noise, on the same fixed starts."""
 
     every: int = 10_000
-    """Steps between evaluations."""
+    """Steps between evaluations; 0 for none, at the end neither: then the environment is made only
+    once, as a single device needs it."""
     episodes: int = 10
     """Episodes of each evaluation."""
+    max_episode_steps: int = 2000
+    """Steps after which an episode of an evaluation is cut, if it has not ended by itself."""
     video: Literal["each", "last", "none"] = "each"
     """Which evaluations to film (their first episode)."""
-    references: bool = True
-    """At the end, and where it is not known, take 20 episodes each of random actions and of none to
-    compare with; not with an arm that must not flail (--eval.no-references)."""
+    references: bool = False
+    """At the end, take 20 episodes each of random actions and of none to compare with, where merl
+    does not know their returns. Set for merl's own tasks; on an environment of your own it moves
+    your robot at random."""
 
     def __post_init__(self) -> None:
-        for name in ("every", "episodes"):
-            if getattr(self, name) < 1:
-                raise MerlError(f"eval.{name} must be at least 1, not {getattr(self, name)}")
+        for name, least in (("every", 0), ("episodes", 1), ("max_episode_steps", 1)):
+            if getattr(self, name) < least:
+                flag = name.replace("_", "-")
+                raise MerlError(f"eval.{flag} must be at least {least}, not {getattr(self, name)}")
+
+    def count(self, steps: int) -> int:
+        """Return how many evaluations a run of so many steps has."""
+        return max(1, steps // self.every) if self.every else 0
 
 
 @dataclass(frozen=True)
@@ -67,6 +76,9 @@ class TrainConfig:
     """The seed of everything random in the run."""
     steps: int = 1_000_000
     """Environment steps."""
+    measure: bool = False
+    """Time an environment of your own before the run begins, as merl's own tasks are, with 75
+    random steps; if not set, the first steps of the run are timed."""
     minutes: float | None = None
     """Stop after this many minutes (since start or resume), if the steps are not done before."""
     run_dir: Path | None = None
@@ -95,10 +107,16 @@ class TrainConfig:
     worker_timeout: float = 30.0
     """Seconds in which an environment's process has to answer."""
     save_every: float = 300.0
-    """Seconds between checkpoints; each waits for the end of an episode."""
+    """Seconds between checkpoints; each waits for the end of an episode, unless that takes much
+    longer."""
     keep: int = 2
     """How many of the last checkpoints are kept, beside the best."""
-    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
+    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: EnvConfig(renderer="gl")
+    )
+    user_env: Annotated[UserEnvConfig, tyro.conf.arg(name="env")] = field(
+        default_factory=UserEnvConfig
+    )
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     agent: AgentConfig = field(default_factory=lambda: AGENTS["merl"])
     eval: EvaluationConfig = field(default_factory=EvaluationConfig)
@@ -136,9 +154,9 @@ class TrainConfig:
                 raise MerlError(f"{flag} must be finite and at least 0, not {getattr(self, name)}")
         if self.replay.batch_size > self.capacity:
             raise MerlError(
-                f"replay.batch-size {self.replay.batch_size} is more than the {self.capacity} "
-                "steps of the run, which is all that the replay will hold: use a smaller batch or "
-                "more steps"
+                f"replay.batch-size {self.replay.batch_size} is more than the "
+                f"{counted(self.capacity, 'step')} of the run, which is all that the replay will "
+                "hold: use a smaller batch or more steps"
             )
 
     @property
@@ -150,6 +168,11 @@ class TrainConfig:
     def has_workers(self) -> bool:
         """Whether environments act in processes of their own."""
         return self.num_envs > 1 or not self.synchronous
+
+    @property
+    def eval_steps(self) -> int:
+        """Actions after which an episode of an evaluation is cut; each may be held for steps."""
+        return math.ceil(self.eval.max_episode_steps / self.action_repeat)
 
     @property
     def capacity(self) -> int:

@@ -1,150 +1,256 @@
-"""The live view of a run: progress, speed, what training and evaluation bring."""
+"""The live view of a run: progress, speed, and the results of training and evaluation."""
 
 from __future__ import annotations
 
+import csv
 import time
 from collections import deque
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from statistics import mean
 
+import numpy as np
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from merl.core import METRICS_FILE, counted
 from merl.training.evaluation import Evaluation
 from merl.training.loop import Moment
 from merl.training.run import Run
 
-RECENT = 10  # training episodes that the shown means are of
-PLAIN_INTERVAL = 30.0  # seconds between lines where there is no terminal
+RECENT = 10
+"""Training episodes over which the shown means are taken."""
+PLAIN_INTERVAL = 30.0
+"""Seconds between two lines where there is no terminal."""
+SPARKS = "▁▂▃▄▅▆▇█"
+ASCII_SPARKS = "_.-=+*%#"
+SPARK_WIDTH = 40
+"""Characters of a sparkline; more values than that are averaged."""
 
 
 class ConsoleView:
-    """Shows a run on a terminal as a live table, elsewhere as plain lines."""
+    """Shows a run as a live table on a terminal, and as plain lines elsewhere.
 
-    def __init__(self, console: Console) -> None:
+    Args:
+        console: where to print.
+        scale: name -> return of what the agent's returns are compared with, from the lowest to the
+            highest, e.g. random actions and an expert; empty if unknown.
+    """
+
+    def __init__(self, console: Console, scale: Mapping[str, float] | None = None) -> None:
         self.console = console
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=None),
-            TaskProgressColumn(),
-            TextColumn("{task.fields[left]}"),
-            console=console,
-        )
-        self._live = Live(console=console, refresh_per_second=4, transient=False)
-        self._numbers: dict[str, float] = {}
+        self._scale = dict(scale or {})
+        self._is_live = console.is_interactive
+        self._speed = self._training = self._learner = self._evaluation = self._note = ""
         self._recent: deque[dict[str, float]] = deque(maxlen=RECENT)
-        self._evaluation = Text("none yet", style="dim")
-        self._note = ""
-        self._said = self._recent_time = time.perf_counter()
-        self._recent_step = 0
+        self._returns: list[float] = []  # of all evaluations
+        self._training_return: float | None = None  # of the last episode
+        self._step = self._total = self._learning_starts = 0
+        self._minutes: float | None = None
+        self._start = self._printed = time.perf_counter()
+        self._learning_since: tuple[float, int] | None = None  # time and step of the first update
+        # Rich draws in a thread of its own: what it shows is replaced, never changed in place.
+        self._live = Live(
+            console=console, refresh_per_second=4, transient=False, get_renderable=self._draw
+        )
 
     def __enter__(self) -> ConsoleView:
-        """Begin to draw, once training begins."""
+        """Return the view; it draws once training begins."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the last picture standing."""
+        """Leave the last drawing on the terminal."""
         if self._live.is_started:
-            self._live.update(self._picture(), refresh=True)
+            self._live.refresh()
             self._live.stop()
 
     def begin(self, run: Run, step: int) -> None:
-        """Training begins or goes on."""
-        self._total, self._minutes = run.config.steps, run.config.minutes
-        self._task = self._bar.add_task("steps", total=self._total, left="")
-        self._start = time.perf_counter()
-        self._recent_step = step
-        if self.console.is_terminal:
+        """Start to show a run that begins, or resumes, at `step`."""
+        config = run.config
+        self._total, self._minutes = config.steps, config.minutes
+        self._step = step
+        self._learning_starts = config.seed_steps
+        self._returns = _earlier_returns(run)
+        every = config.eval.every
+        self._evaluation = f"the first one after step {every:,}, or at the end" if every else ""
+        self._start = self._printed = time.perf_counter()
+        if self._is_live:
             self._live.start()
+        elif self._scale:
+            self._print(f"returns to compare with: {self._compared()}")
 
     def moment(self, moment: Moment, metrics: dict[str, float]) -> None:
-        """A step was taken."""
-        self._bar.update(
-            self._task,
-            completed=moment.step,
-            description=f"step {moment.step:,} of {self._total:,}",
-            left=self._time_left(moment.step),
+        """Show an environment step; `metrics` is empty unless an episode ended."""
+        self._step = moment.step
+        if self._learning_since is None and moment.updates:
+            self._learning_since = time.perf_counter(), moment.step
+        if not metrics:
+            return
+        self._recent.append(metrics)
+        self._training_return = metrics["train/return"]
+        self._training = self._recent_training(moment.updates)
+        self._speed = (
+            f"{metrics['time/steps_per_second']:.0f} steps/s, "
+            f"{metrics['time/updates_per_second']:.0f} updates/s"
         )
-        if metrics:
-            self._numbers = metrics
-            self._recent.append(metrics)
-            self._show(moment)
+        if "learn/q" in metrics:
+            self._learner = (
+                f"Q {metrics['learn/q']:.2f}, critic loss {metrics['learn/critic_loss']:.2g}"
+            )
+        if not self._is_live and time.perf_counter() - self._printed > PLAIN_INTERVAL:
+            self._printed = time.perf_counter()
+            left = self._time_left()
+            self._print(
+                f"{self._position()} ({self._fraction():.0%}{f', {left}' if left else ''}): "
+                f"training {self._training}; {self._speed}"
+            )
 
     def evaluating(self, episode: int, total: int) -> None:
-        """An evaluation goes on: the episode's index, of how many."""
-        note = f"evaluating: episode {episode + 1} of {total}"
-        if note != self._note and self._live.is_started:
-            self._note = note
-            self._live.update(self._picture())
+        """Show that an evaluation is in episode `episode` (from 0) of `total`."""
+        self._note = f"evaluating: episode {episode + 1} of {total}"
 
     def evaluated(self, step: int, evaluation: Evaluation) -> None:
-        """An evaluation is done."""
+        """Show the result of an evaluation."""
         self._note = ""
-        self._evaluation = Text(f"at step {step:,}: {describe(evaluation)}")
-        if not self.console.is_terminal:
-            self.console.print(f"evaluation at step {step:,}: {describe(evaluation)}")
+        self._returns = [*self._returns, evaluation.returns.mean]
+        self._evaluation = f"at step {step:,}: {describe(evaluation)}"
+        if not self._is_live:
+            self._print(f"evaluation {self._evaluation}{self._excuse()}")
+            if len(self._returns) > 1:
+                self._print(f"returns of all evaluations: {self._sparkline()}")
 
     def saved(self, step: int) -> None:
-        """A checkpoint is on the disk."""
+        """Show that a checkpoint was written."""
         self._note = f"saved at step {step:,}"
 
     def warn(self, message: str) -> None:
-        """Something that the user should know."""
-        self.console.print(f"warning: {message}", style="yellow", markup=False)
+        """Print what the user should know."""
+        self.console.print(f"warning: {message}", style="yellow", markup=False, soft_wrap=True)
 
-    def _show(self, moment: Moment) -> None:
-        if self._live.is_started:
-            self._live.update(self._picture())
-        elif time.perf_counter() - self._said > PLAIN_INTERVAL:
-            self._said = time.perf_counter()
-            n = self._numbers
-            self.console.print(
-                f"step {moment.step:,}/{self._total:,}  "
-                f"{self._training()}  "
-                f"{n['time/steps_per_second']:.0f} steps/s  "
-                f"{n['time/updates_per_second']:.0f} updates/s  "
-                f"{self._time_left(moment.step)}",
-                highlight=False,
-            )
+    def _print(self, line: str) -> None:
+        self.console.print(line, highlight=False, soft_wrap=True)
 
-    def _time_left(self, step: int) -> str:
-        """From the pace of this stretch; bounded by the minutes that it may take."""
-        passed = time.perf_counter() - self._start
-        taken = step - self._recent_step
-        if passed < 5 or taken < 50:
-            return ""
-        left = (self._total - step) * passed / taken
+    def _draw(self) -> Group:
+        """The live table."""
+        bar = Table.grid(padding=(0, 1), expand=True)
+        bar.add_column()
+        bar.add_column(ratio=1)
+        bar.add_column()
+        fraction = self._fraction()
+        bar.add_row(Text(f"{fraction:4.0%}"), ProgressBar(1.0, fraction), Text(self._time_left()))
+        rows = {
+            "progress": self._position(),
+            "speed": self._speed,
+            "training": self._training,
+            "learner": self._learner,
+            "evaluation": self._evaluation,
+            "evaluations": self._sparkline() if len(self._returns) > 1 else "",
+            "compare with": self._compared(),
+        }
+        table = Table.grid(padding=(0, 2))
+        for name, text in rows.items():
+            if text:
+                table.add_row(Text(name, no_wrap=True), Text(text))
+        return Group(bar, table, Text(self._note, style="dim"))
+
+    def _position(self) -> str:
+        """The steps so far, and the minutes where they are limited."""
+        steps = f"step {self._step:,} of {self._total:,}"
+        if self._minutes is None:
+            return steps
+        limit = self._minutes * 60
+        passed = min(time.perf_counter() - self._start, limit)
+        return f"{_clock(passed)} of {_clock(limit)}, or {steps}"
+
+    def _fraction(self) -> float:
+        """How much of the run is done, by the limit that is reached first: steps or minutes."""
+        fraction = self._step / max(self._total, 1)
         if self._minutes is not None:
-            left = min(left, max(0.0, self._minutes * 60 - passed))
-        return f"{timedelta(seconds=round(left))} left"
+            passed = time.perf_counter() - self._start
+            fraction = max(fraction, passed / (self._minutes * 60))
+        return min(fraction, 1.0)
 
-    def _picture(self) -> Group:
-        n = self._numbers
-        table = Table.grid(padding=(0, 3))
-        if n:
-            table.add_row(
-                "speed",
-                f"{n['time/steps_per_second']:.0f} steps/s",
-                f"{n['time/updates_per_second']:.0f} updates/s",
-            )
-            table.add_row("training", self._training())
-            if "learn/q" in n:
-                table.add_row(
-                    "learner", f"Q {n['learn/q']:.2f}", f"critic loss {n['learn/critic_loss']:.2g}"
-                )
-        table.add_row("evaluation", self._evaluation)
-        return Group(self._bar, table, Text(self._note, style="dim"))
+    def _time_left(self) -> str:
+        """An estimate, by the limit that is reached first; empty while there is none.
 
-    def _training(self) -> str:
-        """Return and success of the last training episodes, noise and all."""
+        Steps before the first update are much faster: the pace is that of the steps after it.
+        """
+        now, estimates = time.perf_counter(), []
+        if self._minutes is not None:
+            estimates.append(self._minutes * 60 - (now - self._start))
+        if self._learning_since is not None:
+            since, first = self._learning_since
+            if now - since >= 5 and self._step - first >= 50:
+                estimates.append((self._total - self._step) * (now - since) / (self._step - first))
+        left = min(estimates, default=0.0)
+        return f"{_clock(left)} left" if left > 0 else ""
+
+    def _recent_training(self, updates: int) -> str:
+        """Return and success of the last training episodes, which include exploration noise."""
         values = f"return {mean(row['train/return'] for row in self._recent):.1f}"
-        ends = [row["train/success_end"] for row in self._recent if "train/success_end" in row]
-        if ends:
-            values += f", success {mean(ends):.0%}"
-        return f"{values} (last {len(self._recent)})"
+        name = "train/success_end"
+        if any(name in row for row in self._recent):  # a row without it failed
+            values += f", success {mean(row.get(name, 0.0) for row in self._recent):.0%}"
+        count = len(self._recent)
+        about = f"the last {count} episodes, with noise" if count > 1 else "one episode, with noise"
+        if not updates:
+            about += f"; learning begins at step {self._learning_starts:,}"
+        return f"{values} ({about})"
+
+    def _compared(self) -> str:
+        """The returns to compare with; why the agent's may be below all of them."""
+        names = ", ".join(f"{name} {value:.1f}" for name, value in self._scale.items())
+        return f"{names}{self._excuse()}"
+
+    def _excuse(self) -> str:
+        """Why the newest return may be below all that it is compared with; empty if it is not."""
+        newest = self._returns[-1] if self._returns else self._training_return
+        if newest is None or not self._scale or newest >= min(self._scale.values()):
+            return ""
+        return f"; at first an agent is often below {min(self._scale, key=self._scale.__getitem__)}"
+
+    def _sparkline(self) -> str:
+        """The returns of all evaluations, from the lowest to the highest that is shown."""
+        known = [*self._returns, *self._scale.values()]
+        low, high = min(known), max(known)
+        encoding = (self.console.encoding or "").lower()
+        line = sparkline(self._returns, low, high, SPARKS if "utf" in encoding else ASCII_SPARKS)
+        return f"{line} (scale: {low:.1f} to {high:.1f})"
+
+
+def sparkline(values: Sequence[float], low: float, high: float, levels: str = SPARKS) -> str:
+    """Draw values as one line of characters.
+
+    Args:
+        values: at least one; more than `SPARK_WIDTH` are averaged in groups of neighbours.
+        low: the value of the lowest character.
+        high: the value of the highest character.
+        levels: the characters, from the lowest to the highest.
+    """
+    groups = np.array_split(np.asarray(values), min(len(values), SPARK_WIDTH))
+    means = np.array([group.mean() for group in groups])
+    share = (means - low) / max(high - low, 1e-9)
+    return "".join(levels[index] for index in np.rint(share * (len(levels) - 1)).astype(int))
+
+
+def _earlier_returns(run: Run) -> list[float]:
+    """The mean returns of a resumed run's evaluations so far; empty for a new one."""
+    try:
+        with (run.path / METRICS_FILE).open(newline="", encoding="utf-8") as file:
+            return [
+                float(row["eval/return"]) for row in csv.DictReader(file) if row.get("eval/return")
+            ]
+    except OSError:
+        return []
+
+
+def _clock(seconds: float) -> str:
+    """Seconds as minutes:seconds or hours:minutes:seconds."""
+    text = str(timedelta(seconds=round(seconds)))
+    return text.removeprefix("0:")
 
 
 def describe(evaluation: Evaluation) -> str:
@@ -152,9 +258,10 @@ def describe(evaluation: Evaluation) -> str:
     returns, end = evaluation.returns, evaluation.success_end
     line = f"return {returns.mean:.1f} [{returns.low:.1f}, {returns.high:.1f}]"
     if end is not None and evaluation.success_any and evaluation.success_share:
-        line += (
-            f", success {end.mean:.0%} [{end.low:.0%}, {end.high:.0%}] at the end, "
-            f"{evaluation.success_any.mean:.0%} at any time, "
-            f"{evaluation.success_share.mean:.0%} of the steps"
-        )
-    return f"{line} ({len(evaluation.episodes)} episodes)"
+        line += f", success {end.mean:.0%} [{end.low:.0%}, {end.high:.0%}] at the end"
+        if not end.mean == evaluation.success_any.mean == evaluation.success_share.mean:
+            line += (
+                f", {evaluation.success_any.mean:.0%} at any time, "
+                f"{evaluation.success_share.mean:.0%} of the steps"
+            )
+    return f"{line} ({counted(len(evaluation.episodes), 'episode')})"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import warnings
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,20 +18,19 @@ from numpy.typing import NDArray
 
 from merl.agents import make_agent
 from merl.core import Agent, MerlError, NotFinite, Observation, is_image
+from merl.envs.user_spaces import Modality
 from merl.statistics import Interval, bootstrap_interval, wilson_interval
 from merl.training.checkpoint import Checkpoint, load_networks
-from merl.training.config import TrainConfig
+from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.environment import make_run_env, own_bounds, run_spaces
+from merl.training.generators import kept_generators, seed_global_generators
 from merl.training.guards import check_moment
-from merl.training.rollout import Episode, FrameStack
+from merl.training.recording import EpisodeVideo, warn_user
+from merl.training.rollout import Episode, FrameStack, report_success
 from merl.training.run import Run
-from merl.training.video import VideoWriter
 
 EVALUATION_SEED = 1_000_000
 """Episode i of every evaluation starts from `env.reset(seed=EVALUATION_SEED + i)`."""
-
-LONGEST = 100_000
-"""Steps of an episode of an evaluation, lest one that never ends be waited for."""
 
 Act = Callable[[Observation], NDArray[np.float32]]
 
@@ -43,6 +43,7 @@ class Policy:
     Attributes:
         config: of the run that it comes from.
         step: environment steps after which it was saved.
+        reports_success: the environment was known to report success by then.
     """
 
     def __init__(
@@ -53,10 +54,12 @@ class Policy:
         device: torch.device,
         step: int = 0,
         run: Run | None = None,
+        reports_success: bool = False,
     ) -> None:
         self.config, self.step, self._run = config, step, run
+        self.reports_success = reports_success
         self._agent = agent
-        self._space = {key: space[key] for key in agent.senses}
+        self._modalities = {key: _as_trained(key, space[key]) for key in agent.senses}
         images = tuple(key for key in agent.senses if is_image(space[key]))
         self._stack = FrameStack(config.replay.frame_stack, images, device)
         self._fresh = True
@@ -75,11 +78,11 @@ class Policy:
             float32 (A,), in [-1, 1].
 
         Raises:
-            MerlError: a key is missing or has another shape or type than the agent was trained
-                with.
-            NotFinite: a number of it is none.
+            MerlError: a key is missing, has another shape or type than the agent was trained
+                with, or cannot be converted to an array.
+            NotFinite: it holds NaN or infinity.
         """
-        sensed = {key: self._checked(key, observation) for key in self._space}
+        sensed = {key: self._checked(key, observation) for key in self._modalities}
         if self._fresh:
             self._stack.reset(sensed)
         else:
@@ -89,19 +92,31 @@ class Policy:
         result: NDArray[np.float32] = action.to("cpu", torch.float32).numpy()
         return result
 
-    def make_env(self, **changes: Any) -> gymnasium.Env[Any, Any]:
-        """The environment that the agent was trained in, with fields of `EnvConfig` changed.
+    def make_env(self, *, trust: bool = False, **changes: Any) -> gymnasium.Env[Any, Any]:
+        """Make the environment that the agent was trained in.
+
+        Args:
+            trust: import the environment that the run names, although you have not trained this
+                run on this machine: that runs the code of whoever made the run. Not needed for
+                merl's own tasks and Gymnasium's.
+            **changes: fields of `EnvConfig`, and `render_mode`; the renderer `auto` is that of the
+                training.
 
         Raises:
-            MerlError: it cannot be made, or is no longer what the agent was trained in.
+            MerlError: it is not trusted, cannot be made, or is no longer what the agent was
+                trained in.
         """
         renderer = changes.get("renderer", self.config.env.renderer)
+        if renderer == "auto" and not self.config.own_env:
+            renderer = changes["renderer"] = self.config.env.renderer
         if renderer != self.config.env.renderer and not self.config.own_env:
             warnings.warn(
                 f"the agent was trained with renderer {self.config.env.renderer!r} and sees "
                 f"{renderer!r} now: these pictures differ, and it may do worse",
                 stacklevel=2,
             )
+        if self._run is not None:
+            self._run.load_module(trusted=trust)
         env = make_run_env(self.config, **changes)
         if self._run is not None and self.config.own_env:
             try:
@@ -112,22 +127,16 @@ class Policy:
         return env
 
     def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
-        space = self._space[key]
+        if not isinstance(observation, Mapping):
+            raise MerlError(
+                f"the observation is of {type(observation).__name__}: a dict with "
+                f"{list(self._modalities)} is needed"
+            )
         if key not in observation:
             raise MerlError(
-                f"the observation lacks {key!r}: the agent consumes {list(self._space)}"
+                f"the observation lacks {key!r}: the agent consumes {list(self._modalities)}"
             )
-        value = np.asarray(observation[key])
-        if value.shape != space.shape:
-            raise MerlError(f"observation {key!r} has shape {value.shape}: {space.shape} is needed")
-        if is_image(space) and value.dtype != np.uint8:
-            raise MerlError(
-                f"observation {key!r} is of {value.dtype}: pixels from 0 to 255, uint8, are needed"
-            )
-        try:
-            value = value.astype(space.dtype, copy=False)
-        except (TypeError, ValueError):
-            raise MerlError(f"observation {key!r} holds what is no number") from None
+        value = self._modalities[key].convert(observation[key])
         if not np.isfinite(value).all():
             raise NotFinite(f"observation {key!r} holds a NaN or an infinity: {value}")
         return value
@@ -141,9 +150,11 @@ class Evaluation:
         episodes: one by one, in the order of their seeds.
         returns: the mean return with its bootstrap interval.
         success_end: the rate of success at the last step, with Wilson's interval; None where the
-            environment does not say.
+            environment does not report success.
         success_any: likewise, at any step.
-        success_share: the mean share of steps that are a success, with its bootstrap interval.
+        success_share: of the steps that report success or failure, the mean share of successes,
+            with its bootstrap interval.
+        starts: a digest of each episode's first observation.
     """
 
     episodes: tuple[Episode, ...]
@@ -151,6 +162,11 @@ class Evaluation:
     success_end: Interval | None
     success_any: Interval | None
     success_share: Interval | None
+    starts: tuple[str, ...] = ()
+
+    def starts_as(self, other: Evaluation) -> bool:
+        """Whether the episodes start as those of another evaluation, as far as both go."""
+        return all(mine == its for mine, its in zip(self.starts, other.starts, strict=False))
 
     def metrics(self) -> dict[str, float]:
         """By name, as they stand in `metrics.csv` (behind `eval/`)."""
@@ -183,8 +199,10 @@ def evaluate(
     video: Path | None = None,
     tick: Callable[[int], None] = lambda episode: None,
     warn: Callable[[str], None] | None = None,
+    max_steps: int = EvaluationConfig.max_episode_steps,
+    reports_success: bool = False,
 ) -> Evaluation:
-    """Run episodes from the evaluation's starts.
+    """Run episodes from the evaluation's starts; random generators are left as they were.
 
     Args:
         act: observation to action.
@@ -193,34 +211,48 @@ def evaluate(
         reset: called before each episode.
         video: where to film the first episode.
         tick: called after every step, with the number of the episode; may raise to end it.
-        warn: is told if the video cannot be made, and the evaluation goes on without it; without
-            `warn` that is an error.
+        warn: receives warnings (default: Python's). If the video cannot be made, the evaluation
+            goes on without it and warns; without `warn` that is an error.
+        max_steps: steps after which an episode is cut, as by a time limit, with a warning.
+        reports_success: the environment is known to report success, see `summarize`.
+
+    Raises:
+        MerlError: the environment failed, or the video could not be made and `warn` is None.
+        NotFinite: a reward or an observation is NaN or infinite.
     """
-    results = []
-    for index in range(episodes):
-        reset()
-        film = video if index == 0 else None
-        try:
-            results.append(_run_episode(act, env, index, film, tick))
-        except MerlError as error:
-            if film is None or warn is None:
-                raise
-            warn(str(error))
+    results, starts = [], []
+    with kept_generators(env):
+        for index in range(episodes):
             reset()
-            results.append(_run_episode(act, env, index, None, tick))
-    return summarize(results)
+            film = EpisodeVideo(video, env, warn) if video is not None and index == 0 else None
+            episode, start, ended = _run_episode(act, env, index, film, tick, max_steps)
+            results.append(episode)
+            starts.append(start)
+            if not ended:
+                (warn or warn_user)(
+                    f"an episode of the evaluation was cut after {max_steps:,} steps and counts as "
+                    "truncated: --eval.max-episode-steps sets the limit "
+                    "(merl evaluate: --max-episode-steps)"
+                )
+    summary = summarize(results, reports_success=reports_success)
+    return dataclasses.replace(summary, starts=tuple(starts))
 
 
-def summarize(episodes: list[Episode]) -> Evaluation:
-    """Means and intervals over episodes."""
-    told = [e for e in episodes if e.success is not None]  # the others do not speak of success
-    count = len(told)
+def summarize(episodes: list[Episode], *, reports_success: bool = False) -> Evaluation:
+    """Means and intervals over episodes.
+
+    Args:
+        episodes: one or more.
+        reports_success: the environment is known to report success: an episode without a report
+            failed. It is known in any case if one of these episodes has reported.
+    """
+    reports, count = reports_success or report_success(episodes), len(episodes)
     return Evaluation(
         tuple(episodes),
         bootstrap_interval([e.total_reward for e in episodes]),
-        wilson_interval(sum(bool(e.success) for e in told), count) if told else None,
-        wilson_interval(sum(e.successes > 0 for e in told), count) if told else None,
-        bootstrap_interval([e.successes / e.length for e in told]) if told else None,
+        wilson_interval(sum(bool(e.success) for e in episodes), count) if reports else None,
+        wilson_interval(sum(e.successes > 0 for e in episodes), count) if reports else None,
+        bootstrap_interval([e.success_share for e in episodes]) if reports else None,
     )
 
 
@@ -228,52 +260,63 @@ def _run_episode(
     act: Act,
     env: gymnasium.Env[Any, Any],
     index: int,
-    video: Path | None,
+    film: EpisodeVideo | None,
     tick: Callable[[int], None],
-) -> Episode:
+    max_steps: int,
+) -> tuple[Episode, str, bool]:
+    """Run one episode; return it, the digest of its start, and whether it ended by itself."""
     episode, over = Episode(), False
-    observation, _ = env.reset(seed=EVALUATION_SEED + index)
-    with ExitStack() as stack:
-        film = None
-        if video is not None:
-            fps = env.metadata.get("render_fps", 25)
-            film = stack.enter_context(VideoWriter(video, fps=fps))
-        while not over:
+    seed = EVALUATION_SEED + index
+    seed_global_generators(seed)
+    observation, _ = env.reset(seed=seed)
+    start = _digest(observation)
+    try:
+        while not over and episode.length < max_steps:
             observation, reward, terminated, truncated, info = env.step(act(observation))
             check_moment(observation, float(reward), episode.length + 1, "of an evaluation")
             episode.add(float(reward), info)
-            over = terminated or truncated
-            if episode.length >= LONGEST and not over:
-                raise MerlError(
-                    f"an episode of the evaluation is not over after {LONGEST:,} steps: give the "
-                    "environment a limit, gymnasium.wrappers.TimeLimit"
-                )
+            over = bool(terminated or truncated)
             if film is not None:
-                film.add(np.asarray(env.render()), _caption(episode))
+                film.add(episode)
             tick(index)
-    return episode
+        if film is not None:
+            film.close()
+    finally:
+        if film is not None:
+            film.abort()  # without effect on one that is complete
+    return episode, start, over
 
 
-def _caption(episode: Episode) -> dict[str, str | float | bool | int]:
-    caption: dict[str, str | float | bool | int] = {
-        "step": episode.length,
-        "return": episode.total_reward,
-    }
-    if episode.success is not None:
-        caption["success"] = episode.success
-    return caption
+def _digest(observation: Observation) -> str:
+    digest = hashlib.sha256()
+    for key in sorted(observation):
+        digest.update(np.ascontiguousarray(observation[key]).tobytes())
+    return digest.hexdigest()
 
 
-def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:
-    """The policy that a run has learnt.
+def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
+    """The check of an observation key that has the form which agents take already."""
+    assert isinstance(space, spaces.Box)
+    return Modality(key, space, space)
+
+
+def load_policy(
+    run: str | Path, *, checkpoint: str | int = "latest", threads: int | None = 1
+) -> Policy:
+    """Load the policy that a run has learnt; no code of the run is imported or executed.
 
     Args:
         run: the run's folder.
         checkpoint: "latest", "best" (by evaluation return), or a checkpoint's number of steps.
+        threads: processor threads that compute an action; None takes torch's own setting. For one
+            observation, several threads mostly wait for each other. Torch's setting for the rest
+            of the program is restored after each action.
 
     Raises:
         MerlError: there is no run, or no whole checkpoint in it.
     """
+    if threads is not None and (type(threads) is not int or threads < 1):
+        raise MerlError(f"threads is {threads!r}: give a whole number, at least 1, or None")
     opened = Run.open(Path(run))
     saved = Checkpoint.find(opened.checkpoints, str(checkpoint))
     config, device = opened.config, torch.device("cpu")
@@ -287,6 +330,15 @@ def load_policy(run: str | Path, *, checkpoint: str | int = "latest") -> Policy:
         frame_stack=config.replay.frame_stack,
         seed=0,
         device=device,
+        threads=threads,
     )
     load_networks(agent.networks, saved)
-    return Policy(agent, config, observation_space, device, step=saved.step, run=opened)
+    return Policy(
+        agent,
+        config,
+        observation_space,
+        device,
+        step=saved.step,
+        run=opened,
+        reports_success=saved.state()["progress"].get("reports_success", False),
+    )

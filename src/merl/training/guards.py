@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -26,8 +27,11 @@ def check_moment(observation: Observation, reward: float, step: int, where: str 
         NotFinite: naming the value and the step.
     """
     at = f"at step {step:,} {where}".rstrip()
-    if not abs(reward) <= np.finfo(np.float32).max:  # beyond it, the replay would keep infinity
-        raise NotFinite(f"the environment's reward is {reward} {at}")
+    if not abs(reward) <= float(
+        np.finfo(np.float32).max
+    ):  # beyond it, the replay would keep infinity
+        beyond = ", which is beyond float32," if math.isfinite(reward) else ""
+        raise NotFinite(f"the environment's reward is {reward}{beyond} {at}")
     for key, value in observation.items():
         value = np.asarray(value)
         if value.dtype.kind == "f" and not np.isfinite(value).all():

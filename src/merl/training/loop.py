@@ -33,7 +33,9 @@ class Progress:
     updates: int = 0
     episodes: int = 0
     evaluated: int = 0  # the step of the last evaluation
+    attempts: int = 0  # at the evaluation that is due, which failed or was killed so far
     restarts: int = 0  # of environments' processes
+    reports_success: bool = False  # an episode of the environment has reported success or failure
 
 
 @dataclass(frozen=True)

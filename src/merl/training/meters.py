@@ -76,23 +76,41 @@ class Clock:
 
 
 class Interval:
-    """When to save, where that can be done only now and then: at an episode's end.
+    """When to save: at an episode's end, or within one that takes much longer than usual.
 
     Args:
         seconds: that may lie between two saves.
         now: tells the time, in seconds.
     """
 
+    LEAST = 5.0
+    """Seconds: a shorter interval does not make saves within an episode more frequent."""
+
     def __init__(self, seconds: float, now: Callable[[], float] = time.perf_counter) -> None:
         self._seconds, self._now = seconds, now
         self._saved = self._chance = now()
+        self._longest = 0.0  # between two chances
+        self._within = False  # the last save was within an episode
 
     def is_due(self) -> bool:
         """At a chance to save: whether the next one, as far away as the last, would be too late."""
         now = self._now()
         apart, self._chance = now - self._chance, now
-        return now + apart - self._saved > self._seconds
+        self._longest = max(self._longest, apart)
+        # A run resumes exactly only from an episode's end: a save within one is soon replaced.
+        return self._within or now + apart - self._saved > self._seconds
 
-    def saved(self) -> None:
-        """A save is done, or was tried."""
-        self._saved = self._chance = self._now()
+    def is_overdue(self) -> bool:
+        """Within an episode: whether its end is too late to wait for with the next save."""
+        patience = 2 * max(self._seconds, self.LEAST) + 3 * self._longest
+        return self._now() - self._saved > patience
+
+    def saved(self, within: bool = False) -> None:
+        """Count from here: a save is done, or was tried.
+
+        Args:
+            within: it was within an episode.
+        """
+        self._saved, self._within = self._now(), within
+        if not within:
+            self._chance = self._saved

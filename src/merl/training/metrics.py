@@ -53,6 +53,7 @@ class MetricsWriter:
         self._warned = False
         self._closed = False
         self._columns, self._rows = _read_rows(self._path)
+        self._written = 0  # rows that the file holds as memory does
         self._tail = 0  # byte at which the last row's line begins
         self._file: io.FileIO | None = None  # None: the file is behind memory, rewrite it whole
         self._events: _EventFile | None = None
@@ -78,6 +79,11 @@ class MetricsWriter:
     def last_step(self) -> int | None:
         """The last step that has a row; None if there is no row."""
         return int(self._rows[-1]["step"]) if self._rows else None
+
+    @property
+    def unwritten(self) -> int:
+        """How many rows are in memory alone, since they could not be written."""
+        return len(self._rows) - self._written
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Record what was measured at `step`.
@@ -108,6 +114,7 @@ class MetricsWriter:
 
         begin = self._tail if step == last else self._end()
         file = self._take_file()
+        self._written = min(self._written, len(self._rows) - (step == last))
         if step != last:
             self._rows.append({"step": str(int(step))})
         self._rows[-1].update({name: repr(value) for name, value in numbers.items()})
@@ -130,6 +137,7 @@ class MetricsWriter:
         if len(kept) < len(self._rows):
             file = self._take_file()
             self._rows = kept
+            self._written = min(self._written, len(kept))
             self._guard(lambda: self._rewrite(file))
             self._guard(lambda: self._forget_events(step))
 
@@ -183,6 +191,7 @@ class MetricsWriter:
             file.close()
             raise
         self._file, self._tail = file, begin
+        self._written = len(self._rows)
 
     def _rewrite(self, old: io.FileIO | None) -> None:
         """Write every row to a temporary file, put it in place of `metrics.csv`, and open that."""
@@ -201,6 +210,7 @@ class MetricsWriter:
             raise
         self._file = io.FileIO(self._path, "r+")
         self._tail = sum(map(len, lines)) - len(lines[-1])
+        self._written = len(self._rows)
 
     def _cells(self, row: Mapping[str, str]) -> Iterable[str]:
         return (row.get(name, "") for name in self._columns)

@@ -7,7 +7,8 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import gymnasium
 import torch
@@ -16,13 +17,16 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
-from merl.core import MerlError
+from merl.core import MerlError, counted
+from merl.envs.own import load_module
 from merl.replay import check_fits
 from merl.resources import available_memory, keep_freed_memory
 from merl.training.config import TrainConfig
-from merl.training.environment import make_run_env, run_spaces
+from merl.training.env_checks import check_instances
+from merl.training.environment import EnvSpaces, make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness
-from merl.training.run import refuse_existing, run_path
+from merl.training.resuming import left_open
+from merl.training.run_folder import refuse_existing, run_path
 from merl.training.timing import measure, use_threads
 from merl.training.video import MIN_SIDE
 
@@ -32,9 +36,11 @@ class Parts:
 
     Attributes:
         config: with `device`, `threads`, the agent's `precision` and `torch_compile` decided.
+        left_open: names of the fields that this machine has decided.
         timing: what this machine needs for a step and an update.
         env: to act in.
-        eval_env: to be evaluated in.
+        eval_env: to be evaluated in; None where there are no evaluations (`eval.every` is 0).
+        home: the working folder at the start, which a relative run folder lies in.
         films: whether that can be filmed.
         space: what the agent consumes.
         action_space: what it does.
@@ -44,21 +50,30 @@ class Parts:
     """
 
     def __init__(
-        self, config: TrainConfig, env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, Any]
+        self,
+        config: TrainConfig,
+        env: gymnasium.Env[Any, Any],
+        eval_env: gymnasium.Env[Any, Any] | None,
+        home: Path,
     ) -> None:
-        self.env, self.eval_env = env, eval_env
-        self.films = eval_env.render_mode == "rgb_array"
+        self.env, self.eval_env, self.home = env, eval_env, home
+        self.films = eval_env is not None and eval_env.render_mode == "rgb_array"
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
         check_memory(config, self.space, self.action_space)
         keep_freed_memory()
-        self.timing = measure(config, env, eval_env, self.space, self.device)
+        # Without evaluations there are no videos whose frames could be timed.
+        timed = config
+        if eval_env is None:
+            timed = dataclasses.replace(config, eval=dataclasses.replace(config.eval, video="none"))
+        self.left_open = left_open(config)
+        self.timing = measure(timed, env, eval_env or env, self.space, self.device)
         best = self.timing.best
         use_threads(best.threads)
         self.config = dataclasses.replace(
             config,
             threads=best.threads,
-            device="cuda" if self.device.type == "cuda" else "cpu",
+            device=device_name(config.device),
             agent=best.decided(config.agent),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
@@ -69,6 +84,7 @@ class Parts:
             frame_stack=config.replay.frame_stack,
             seed=self.randomness.agent,
             device=self.device,
+            threads=best.threads,
         )
 
     @classmethod
@@ -78,7 +94,8 @@ class Parts:
 
         Args:
             config: of the run.
-            new: the run begins, so its folder must not exist and its replay must fit.
+            new: the run begins, so its folder must not exist and its replay must fit; the module of
+                a user's environment is looked for in the working folder.
 
         Raises:
             MerlError: a device, renderer, sense, folder or size that is not to be had.
@@ -87,11 +104,15 @@ class Parts:
         processors = os.cpu_count() or 1
         if config.threads is not None and config.threads > processors:
             raise MerlError(
-                f"threads is {config.threads}, but this machine has {processors} processors: "
+                f"threads is {config.threads}, but this machine has "
+                f"{counted(processors, 'processor')}: "
                 f"give at most {processors}"
             )
+        home = Path.cwd()  # before any user code runs, which may change it
         if new:
-            refuse_existing(run_path(config))
+            refuse_existing(run_path(config, home))
+            if config.own_env and ":" in config.task:
+                load_module(config.task, home)
         with ExitStack() as stack:
             env = make_run_env(config)
             stack.callback(env.close)
@@ -101,14 +122,22 @@ class Parts:
                     config.replay,
                     space,
                     actions,
-                    directory=run_path(config),
+                    directory=run_path(config, home),
                     capacity=config.capacity,
                     lanes=config.num_envs,
                 )
-            size = max(config.env.render_size, MIN_SIDE)
-            eval_env = make_run_env(config, render_mode="rgb_array", render_size=size)
-            stack.callback(eval_env.close)
-            yield cls(config, env, eval_env)
+            eval_env = None
+            if config.eval.every:
+                size = max(config.env.render_size, MIN_SIDE)
+                # Whether a user's environment renders takes a reset to find out.
+                mode = None if config.own_env and config.eval.video == "none" else "rgb_array"
+                eval_env = make_run_env(config, render_mode=mode, render_size=size)
+                stack.callback(eval_env.close)
+                expected = EnvSpaces.of(config, env)
+                expected.check(EnvSpaces.of(config, eval_env), "the one that is evaluated in")
+                if config.own_env:
+                    check_instances(env, eval_env)
+            yield cls(config, env, eval_env, home)
 
 
 def choose_device(name: str) -> torch.device:
@@ -124,6 +153,11 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda":  # a run's shapes never change: trying every way to convolve once pays
         torch.backends.cudnn.benchmark = True
     return torch.device(name)
+
+
+def device_name(name: str) -> Literal["cpu", "cuda"]:
+    """The name of the device that `choose_device` chooses."""
+    return "cuda" if choose_device(name).type == "cuda" else "cpu"
 
 
 def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.Box) -> None:

@@ -64,8 +64,11 @@ def _restore(name: str, hint: Any, value: Any) -> Any:
 
 
 def told(described: Mapping[str, Any]) -> str:
-    """A described box in a few words."""
-    return f"{described['dtype']} {tuple(described['shape'])}"
+    """A described box in a few words; of bytes also the bounds, by which an image is scaled."""
+    words = f"{described['dtype']} {tuple(described['shape'])}"
+    if described["dtype"] == "uint8" and described["bounds"]:
+        words += " from {:g} to {:g}".format(*described["bounds"])
+    return words
 
 
 def describe(space: spaces.Space[Any]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from merl.core import MerlError
@@ -11,6 +11,7 @@ from merl.training.config import TrainConfig
 
 HARMLESS = (
     "steps",
+    "measure",
     "minutes",
     "worker_restarts",
     "worker_timeout",
@@ -21,6 +22,7 @@ HARMLESS = (
     "env.render_size",
     "eval.every",
     "eval.episodes",
+    "eval.max_episode_steps",
     "eval.video",
     "eval.references",
     "agent.precision",
@@ -32,19 +34,51 @@ _LEFT_OPEN = {
     "threads": None,
     "agent.precision": "auto",
     "agent.torch_compile": "auto",
-    "minutes": None,
+    "agent.images": None,
+    "agent.vectors": None,
 }
-"""Values that ask for nothing: what the run has decided stays."""
+"""Values that leave a field open: the machine decides, and what it has decided is recorded."""
+REOPENED = ("threads", "agent.precision", "agent.torch_compile")
+"""Fields that another machine decides anew, if they were left open."""
 _NAMES = ("run_dir", "preset", "setting")
 """Fields that only say where the others are from."""
 
 
-def taken_up(recorded: TrainConfig, asked: TrainConfig) -> tuple[TrainConfig, list[str]]:
+def left_open(config: TrainConfig) -> tuple[str, ...]:
+    """Names of the fields that a config leaves for the machine to decide."""
+    values = dict(_flat(config))
+    return tuple(name for name, value in _LEFT_OPEN.items() if values[name] == value)
+
+
+def reopened(config: TrainConfig, names: Iterable[str] = REOPENED) -> TrainConfig:
+    """A config with fields left open again."""
+    for name in names:
+        config = _replaced(config, name, _LEFT_OPEN[name])
+    return config
+
+
+def decided(config: TrainConfig) -> TrainConfig:
+    """A config that leaves nothing open, with any values."""
+    values = {
+        "device": "cpu",
+        "threads": 1,
+        "agent.precision": "fp32",
+        "agent.torch_compile": "no",
+    }
+    for name, value in values.items():
+        config = _replaced(config, name, value)
+    return config
+
+
+def taken_up(
+    recorded: TrainConfig, asked: TrainConfig, given_open: Iterable[str] = ()
+) -> tuple[TrainConfig, list[str]]:
     """The config with which a run goes on.
 
     Args:
         recorded: what it was trained with so far.
-        asked: what it is to be trained with.
+        asked: what it is to be trained with; a field that is left open keeps its recorded value.
+        given_open: names of fields that are to be decided anew, since the user asks for that.
 
     Returns:
         The recorded config with the harmless changes, and these in words.
@@ -53,12 +87,14 @@ def taken_up(recorded: TrainConfig, asked: TrainConfig) -> tuple[TrainConfig, li
         MerlError: what is asked for would be another run; it names the fields.
     """
     before, after = dict(_flat(recorded)), dict(_flat(asked))
+    open_fields = left_open(asked)
     changed = {
         name: (before.get(name), after.get(name))
         for name in {**before, **after}
         if before.get(name) != after.get(name)
         and name not in _NAMES
-        and not (name in _LEFT_OPEN and after[name] == _LEFT_OPEN[name])
+        and name != "minutes"  # those of the stretch that begins
+        and (name in given_open or name not in open_fields)
     }
     in_words = {
         name: f"{name} {_told(old)} -> {_told(new)}" for name, (old, new) in changed.items()
@@ -72,9 +108,8 @@ def taken_up(recorded: TrainConfig, asked: TrainConfig) -> tuple[TrainConfig, li
     config = recorded
     for name in changed:
         config = _replaced(config, name, after[name])
-    # Minutes are those of a stretch: of the one that begins.
     config = dataclasses.replace(config, minutes=asked.minutes)
-    return config, [words for name, words in in_words.items() if name != "minutes"]
+    return config, list(in_words.values())
 
 
 def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

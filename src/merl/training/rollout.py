@@ -79,7 +79,9 @@ class Fetched:
         self.under_way = tensor.is_cuda
         self._there = tensor
         if self.under_way:
-            self._there = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+            self._there = torch.empty(
+                tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=True
+            )
             self._there.copy_(tensor, non_blocking=True)
             self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self._done.record()
@@ -94,19 +96,22 @@ class Fetched:
 
 @dataclass
 class Episode:
-    """What an episode came to, step by step.
+    """The sums over an episode's steps.
 
     Attributes:
         total_reward: the undiscounted return.
         length: steps.
-        success: whether the last step was a success; None where the environment does not say.
-        successes: how many steps were one.
+        success: whether the last step reported success; None if no step reported success or
+            failure.
+        reports: how many steps reported success or failure.
+        successes: how many steps reported success.
         terms: each term of the reward, summed.
     """
 
     total_reward: float = 0.0
     length: int = 0
     success: bool | None = None
+    reports: int = 0
     successes: int = 0
     terms: dict[str, float] = field(default_factory=dict)
 
@@ -116,25 +121,43 @@ class Episode:
         self.length += 1
         if "success" in info:
             self.success = bool(info["success"])
+            self.reports += 1
             self.successes += self.success
+        elif self.success is not None:
+            self.success = False
         for name, value in info.get("reward_terms", {}).items():
             self.terms[name] = self.terms.get(name, 0.0) + float(value)
 
-    def metrics(self) -> dict[str, float]:
-        """Its numbers by name."""
+    @property
+    def success_share(self) -> float:
+        """The share of the steps that reported success, of those that reported at all."""
+        return self.successes / self.reports if self.reports else 0.0
+
+    def metrics(self, *, reports_success: bool = False) -> dict[str, float]:
+        """Its numbers by name.
+
+        Args:
+            reports_success: the environment reports success, so an episode without a report failed.
+        """
         values = {"return": self.total_reward, "length": float(self.length)}
-        if self.success is not None:
+        if reports_success or self.success is not None:
             values |= {
-                "success_end": float(self.success),
+                "success_end": float(bool(self.success)),
                 "success_any": float(self.successes > 0),
-                "success_share": self.successes / self.length,
+                "success_share": self.success_share,
             }
         return values | {f"reward/{name}": value for name, value in self.terms.items()}
 
 
-def mean_metrics(episodes: Sequence[Episode]) -> dict[str, float]:
-    """The numbers of episodes that ended at the same step, in the mean."""
-    each = [episode.metrics() for episode in episodes]
+def report_success(episodes: Sequence[Episode]) -> bool:
+    """Whether any of these episodes has reported success or failure."""
+    return any(episode.success is not None for episode in episodes)
+
+
+def mean_metrics(episodes: Sequence[Episode], *, reports_success: bool = False) -> dict[str, float]:
+    """The mean of the numbers of episodes that ended at the same step; see `Episode.metrics`."""
+    reports_success = reports_success or report_success(episodes)
+    each = [episode.metrics(reports_success=reports_success) for episode in episodes]
     return {
         name: fmean(metrics[name] for metrics in each if name in metrics)
         for name in dict.fromkeys(name for metrics in each for name in metrics)

@@ -12,16 +12,12 @@ curve.png       the learning curve, drawn when training ends
 from __future__ import annotations
 
 import dataclasses
-import fcntl
-import itertools
 import json
 import os
-import re
 import shlex
 import shutil
-import sys
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,13 +27,25 @@ from gymnasium import spaces
 
 import merl
 from merl.agents import AGENTS
+from merl.agents.networks import modalities
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
-from merl.envs.own import module_folder, search_first
+from merl.envs.own import imports_code, load_module, module_folder
+from merl.training import trust
 from merl.training.config import TrainConfig
 from merl.training.machine import commit, machine, package_versions
 from merl.training.plain import box, describe, from_plain, to_plain, told
+from merl.training.resuming import REOPENED
+from merl.training.run_folder import (
+    PART,
+    create_folder,
+    discard_folder,
+    holds_nothing,
+    lock_folder,
+    program,
+    refuse_existing,
+)
+from merl.training.trust import Origin
 
-LOCK_FILE = "lock"
 FORMAT = 1
 Bounds = tuple[list[float], list[float]]
 """Of an environment's own actions: lower, upper."""
@@ -45,85 +53,143 @@ Bounds = tuple[list[float], list[float]]
 
 @dataclass(frozen=True)
 class Run:
-    """A run's folder and the config that it was started with."""
+    """A run's folder and the config that it was started with.
+
+    Attributes:
+        path: the folder.
+        config: with everything decided that the user left open.
+        left_open: names of the fields that the user left open, so that they are decided anew on
+            another machine (`resuming.REOPENED`).
+        created: this process has created the folder.
+    """
 
     path: Path
     config: TrainConfig
+    left_open: tuple[str, ...] = REOPENED
+    created: bool = False
 
     @classmethod
-    def create(
+    @contextmanager
+    def begin(
         cls,
         config: TrainConfig,
         observation_space: spaces.Dict,
         action_space: spaces.Box,
         bounds: Bounds | None = None,
-    ) -> Run:
-        """Make the folder and record what is run.
+        left_open: tuple[str, ...] = REOPENED,
+        *,
+        home: Path | None = None,
+    ) -> Iterator[Run]:
+        """Create the folder of a new run, lock it, and record what is run; unlock it at the end.
 
         Args:
             config: of the run.
             observation_space: what the agent consumes.
             action_space: what it does, in [-1, 1].
             bounds: of the environment's own actions, where they were rescaled.
+            left_open: names of the fields that the user left open.
+            home: see `run_path`.
 
         Raises:
-            MerlError: the folder exists, or cannot be made.
+            MerlError: the folder holds something, cannot be made, or another process begins a run
+                in it.
         """
-        path = run_path(config)
-        refuse_existing(path)
-        record = {
-            "format": FORMAT,
-            "merl": merl.__version__,
-            "task": config.task,
-            "agent": config.agent_name,
-            "preset": config.preset,
-            "setting": config.setting,
-            "seed": config.seed,
-            "config": to_plain(config),
-            "module_folder": _module_folder(config.task),
-            "observation_space": {key: describe(s) for key, s in observation_space.items()},
-            "action_space": describe(action_space) | {"own_bounds": bounds},
-            "versions": package_versions(),
-            "commit": commit(),
-            "machine": machine(),
-        }
-        try:
-            path.mkdir(parents=True)
-        except OSError as error:
-            raise MerlError(f"the run's folder {path} cannot be made: {error.strerror}") from None
-        run = cls(path, config)
-        try:
-            run._write(record)
-        except MerlError:
-            shutil.rmtree(path, ignore_errors=True)
-            raise
-        return run
+        path, created = create_folder(config, home)
+        run = cls(path, config, left_open, created)
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(run.lock())
+            except BaseException:
+                with suppress(OSError):  # another process has locked it
+                    if created:
+                        path.rmdir()
+                raise
+            refuse_existing(path)  # by the process that had the lock before
+            try:
+                record = {
+                    "format": FORMAT,
+                    "id": trust.identity(),
+                    "merl": merl.__version__,
+                    "task": config.task,
+                    "agent": config.agent_name,
+                    "preset": config.preset,
+                    "setting": config.setting,
+                    "seed": config.seed,
+                    "config": to_plain(config),
+                    "left_open": list(left_open),
+                    "module_folder": _module_folder(config.task),
+                    "observation_space": {k: describe(s) for k, s in observation_space.items()},
+                    "action_space": describe(action_space) | {"own_bounds": bounds},
+                    "versions": package_versions(),
+                    "commit": commit(),
+                    "machine": machine(),
+                }
+                run._write(record)
+                trust.remember(record)
+            except BaseException:
+                run.discard()
+                raise
+            yield run
 
     @classmethod
     def open(cls, path: Path) -> Run:
-        """A run that exists.
+        """Open a run that exists; nothing of it is imported or executed.
 
         Raises:
             MerlError: the folder is not a run's.
         """
+        path = path.absolute()  # user code may change the working folder
         with _readable(path):
             record = _read(path)
             number = record["format"]
             if number != FORMAT:
                 raise MerlError(f"it has format {number}, this merl reads {FORMAT}")
             config = _read_config(record["config"])
-            _recorded_spaces(record)
+            observation_space, _ = _recorded_spaces(record)
+            if config.own_env and "user_env" not in record["config"]:
+                config = _naming_its_keys(config, observation_space)
             _last_machine(record)
-            folder = record.get("module_folder")
-            if folder is not None:  # so that the run works from wherever it is called
-                search_first(Path(folder))
-        return cls(path, dataclasses.replace(config, run_dir=path))
+            trust.origin(record)
+            recorded = record.get("left_open", REOPENED)
+            left_open = tuple(name for name in REOPENED if name in recorded)
+        return cls(path, dataclasses.replace(config, run_dir=path), left_open)
+
+    def load_module(self, *, trusted: bool = False, named_in: Path | None = None) -> None:
+        """Import the module of the run's environment, if the environment is the user's own.
+
+        Args:
+            trusted: the user says that the module may be imported, as `origin` names it.
+            named_in: the folder in which the user named the task, where the module may lie, too.
+
+        Raises:
+            MerlError: nobody says that it may be imported (`trust.check`), or it cannot be.
+        """
+        if not imports_code(self.config.task):
+            return
+        record = _read(self.path)
+        folder: str | None = None
+        try:
+            folder = trust.check(self.path, record).folder
+        except MerlError:
+            if trusted:
+                folder = trust.origin(record).folder
+            elif named_in is None:
+                raise
+        if ":" in self.config.task:
+            folders = [Path(folder) if folder is not None else None, named_in]
+            load_module(self.config.task, *(each for each in folders if each is not None))
+
+    def origin(self) -> Origin | None:
+        """The code that the run names as its environment; None if it is merl's or Gymnasium's."""
+        return trust.origin(_read(self.path)) if imports_code(self.config.task) else None
 
     def record_resumption(self, step: int) -> None:
         """Note that the run goes on from `step`, with what; from now on its config is this one."""
         record = _read(self.path)
         record["config"] = to_plain(self.config)
+        record["left_open"] = list(self.left_open)
         record["module_folder"] = _module_folder(self.config.task)
+        record["id"] = trust.identity(record.get("id"))
         record.setdefault("resumed", []).append(
             {
                 "step": step,
@@ -134,6 +200,7 @@ class Run:
             }
         )
         self._write(record)
+        trust.remember(record)
 
     def check_environment(
         self, observation_space: spaces.Dict, action_space: spaces.Box, bounds: Bounds | None
@@ -198,32 +265,17 @@ class Run:
                 "it: the run stops, and writes nothing in its place"
             )
 
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Keep every other process from training in this folder; the lock dies with the process.
+    def discard(self) -> None:
+        """Remove what this process has written, before the first step of a new run."""
+        discard_folder(self.path, self.created)
 
-        Raises:
-            MerlError: another process trains here.
-        """
-        path = self.path / LOCK_FILE
-        with ExitStack() as stack:
-            try:
-                file = stack.enter_context(path.open("a+"))
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise MerlError(
-                    f"process {path.read_text().strip()} is training in {self.path}: stop it first"
-                ) from None
-            except OSError as error:
-                raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
-            file.truncate(0)
-            file.write(str(os.getpid()))
-            file.flush()
-            yield
+    def lock(self) -> AbstractContextManager[None]:
+        """Keep every other process from training in this folder; see `lock_folder`."""
+        return lock_folder(self.path)
 
     def _write(self, record: Mapping[str, Any]) -> None:
         """Replace `config.json` whole."""
-        part = self.path / f".{CONFIG_FILE}.part"
+        part = self.path / PART
         try:
             with part.open("w") as file:
                 file.write(json.dumps(record, indent=1))
@@ -254,47 +306,18 @@ class Run:
             return _recorded_spaces(_read(self.path))
 
 
-def run_path(config: TrainConfig) -> Path:
-    """The folder that a config names, or the first of the default ones that is free."""
-    if config.run_dir is not None:
-        return config.run_dir
-    agent = config.agent_name if config.setting == "matched" else f"{config.agent_name}-published"
-    task = re.sub(r"[^\w.-]+", "-", config.task)  # `module:function`, `namespace/Id-v0`
-    name = f"{task}-{agent}-{config.preset}-s{config.seed}"
-    numbered = (Path("runs") / f"{name}-{number}" for number in itertools.count(2))
-    return next(p for p in itertools.chain([Path("runs") / name], numbered) if not _exists(p))
-
-
-def resume_line(folder: Path) -> str:
-    """What to type to go on with a run."""
-    return f"{_program()} resume {shlex.quote(str(folder))}"
-
-
-def refuse_existing(path: Path) -> None:
-    """Never write into a folder that holds something.
-
-    Raises:
-        MerlError: the folder exists, or its name is refused by the system.
-    """
-    if _exists(path):
-        raise MerlError(
-            f"run folder {path} exists already: go on with `{resume_line(path)}`, or name another "
-            "with --run-dir"
-        )
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError as error:  # too long a name, a folder that may not be searched
-        raise MerlError(f"run folder {path} cannot be used: {error.strerror}") from None
-
-
 def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
     """A run's config; that of its agent is of the kind that the agent's name says."""
     name = plain.get("agent_name", "merl")
     check_choice("agent", name, tuple(AGENTS))
     return from_plain(TrainConfig, plain, agent=type(AGENTS[name]))
+
+
+def _naming_its_keys(config: TrainConfig, space: spaces.Dict) -> TrainConfig:
+    """Name the keys of a run by an earlier merl, which left `state` out unless it was named."""
+    images, vectors = modalities(config.agent, space)
+    agent = dataclasses.replace(config.agent, images=images, vectors=vectors)
+    return dataclasses.replace(config, agent=agent)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -309,7 +332,13 @@ def _readable(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}") from None
+        way = ""
+        if holds_nothing(path):
+            way = (
+                ", and nothing else: begin it with the line of before, "
+                f"{program()} train ... --run-dir {shlex.quote(str(path))}"
+            )
+        raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}{way}") from None
     except UnicodeDecodeError:
         raise MerlError(f"{file} cannot be read: it is no text") from None
     except KeyError as error:
@@ -336,11 +365,3 @@ def _recorded_spaces(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box
 def _module_folder(task: str) -> str | None:
     folder = module_folder(task)
     return None if folder is None else str(folder)
-
-
-def _program() -> str:
-    """What to type to call this program again: `merl` if the shell would find it."""
-    found, called = shutil.which("merl"), Path(sys.argv[0])
-    if found or called.name != "merl":
-        return "merl"
-    return os.path.relpath(called)

@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from merl.core import EnvironmentFailed, EnvironmentsLost, is_image
+from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, counted, is_image
 from merl.replay import Lanes
 from merl.training import checkpoint
 from merl.training.acting import Environments, Lost
 from merl.training.checkpoint import Checkpoint
-from merl.training.evaluation import Evaluation, Policy, evaluate
+from merl.training.evaluation import Evaluation
+from merl.training.evaluator import Evaluations
 from merl.training.guards import LossGuard
 from merl.training.loop import Moment, Progress, Stage, train
 from merl.training.meters import Averages, Clock, Interval
 from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
 from merl.training.plain import to_plain
-from merl.training.rollout import FrameStack, mean_metrics
-from merl.training.run import Run, resume_line
+from merl.training.rollout import FrameStack, mean_metrics, report_success
+from merl.training.run import Run
+from merl.training.run_folder import resume_line
 from merl.training.signals import Interrupt
 from merl.training.updating import make_update
 
-LONG = 10_000
-"""Steps of an episode, from which on one wonders whether it will end."""
+LONG = 2000
+"""Steps of an episode from which on the user is asked whether it will ever end; or half of the
+run's, if that is less."""
 
 
 class View(Protocol):
@@ -60,6 +65,7 @@ class Outcome:
         evaluation: the last one, if there was any.
         signal: what interrupted it; None if it ran to its end.
         saved: whether its last checkpoint is on the disk.
+        unwritten: rows of metrics that could not be written.
     """
 
     run: Run
@@ -67,10 +73,7 @@ class Outcome:
     evaluation: Evaluation | None
     signal: int | None
     saved: bool
-
-
-class _Interrupted(Exception):  # noqa: N818 (no error, a way out)
-    """An evaluation is to end before its time."""
+    unwritten: int = 0
 
 
 class Stretch:
@@ -90,28 +93,36 @@ class Stretch:
         self.replay, self.environments = replay, environments
         self.metrics, self.view, self.interrupt = metrics, view, interrupt
         self.clock, self.averages, self.guard = Clock(), Averages(), LossGuard()
-        self.evaluation: Evaluation | None = None
+        self.evaluations = Evaluations(parts, run, metrics, view, interrupt)
         self.losses = 0
+        self._saved: dict[str, Any] | None = None  # the progress at the last save
         self._ended: int | None = None  # the last episode's step, until it is long ago
-        self._states: list[dict[str, Any] | None] = [None] * environments.count
+        self._states: Sequence[Mapping[str, Any] | None] = [None] * environments.count
         self._interval = Interval(self.config.save_every)
 
     def train(self) -> Outcome:
-        """Drive the loop to its end; where the environment fails, save before that is told.
+        """Drive the loop to its end; if the environment fails, save before raising.
+
+        Once a signal has arrived, the run ends as stopped, whatever fails because of the signal.
 
         Raises:
-            EnvironmentFailed: the user's environment did; the run can go on.
+            EnvironmentFailed: the user's environment failed; the run can be resumed.
+            EvaluationFailed: an evaluation failed; the run can be resumed.
         """
         try:
             return self._drive()
-        except EnvironmentFailed as failure:
+        except (Exception, KeyboardInterrupt) as error:
+            if isinstance(error, KeyboardInterrupt):  # by a handler of the environment's
+                self.interrupt.note(signal.SIGINT)
+            if self.interrupt.number is not None:
+                return self._outcome(self._save())
             step = self.parts.progress.step
-            if step == 0 or not self._save():
+            if not isinstance(error, EnvironmentFailed) or step == 0 or not self._save():
                 raise
             raise EnvironmentFailed(
-                f"{failure}; the run is saved at step {step:,}: mend it, and go on with "
+                f"{error}; the run is saved at step {step:,}: mend it, and go on with "
                 f"`{resume_line(self.run.path)}`"
-            ) from failure
+            ) from error
 
     def _drive(self) -> Outcome:
         """Between the loop's steps log, evaluate, save, and see whether to stop."""
@@ -131,10 +142,17 @@ class Stretch:
             progress.updates,
         )
         self.view.begin(self.run, progress.step)
-        if not parts.films and self.config.eval.video != "none":
+        evaluates = parts.eval_env is not None
+        if evaluates and not parts.films and self.config.eval.video != "none":
             self.view.warn("there will be no videos: the environment does not render to an array")
-        if progress.step == 0:
-            self._save()  # from here on there is something to go on from
+        if progress.step == 0 and not self._save():  # there must be something to go on from
+            raise MerlError(
+                f"no checkpoint can be written into {self.run.path}: make room on its disk, or "
+                "name a folder on another with --run-dir"
+            )
+        if progress.step and self.evaluations.are_due() and not self.replay.state_dict()["open"]:
+            self._evaluate()  # the run was left before it or within it
+            self._save()
         self.clock.mark(progress)
         self._ended = progress.step
         moments = train(
@@ -147,25 +165,37 @@ class Stretch:
             lambda: self.interrupt.number is not None,
         )
         for count, moment in enumerate(moments):
-            if count == 0 and not moment.lost and None in self._environment_states():
+            if count == 0 and not moment.lost and not self._resumes_exactly():
                 self.view.warn(
-                    "a resumed run will meet other episodes than this one would: the environment "
-                    "does not draw from Gymnasium's np_random"
+                    "a resumed run will meet other episodes than this one would, unless the "
+                    "environment draws from Gymnasium's np_random, or from the global generators "
+                    "of NumPy, Python or torch"
                 )
             self.guard.watch(moment.learning, moment.step)
             self.averages.add(moment.learning)
-            self._watch_for_an_end(moment)
+            self._watch_for_episode_end(moment)
             if moment.lost and not self._is_to_stop():
                 self._lost(moment.lost)
             self.view.moment(moment, self._log(moment) if moment.episodes else {})
-            if moment.episodes and not self._is_to_stop():
-                self._at_episode_end()
             if self._is_to_stop():
                 break
-        if self.interrupt.number is None and progress.evaluated < progress.step:
+            if moment.episodes:
+                self._at_episode_end()
+            elif self._interval.is_overdue():
+                self._save(within=True)
+            if self._is_to_stop():
+                break
+        if evaluates and self.interrupt.number is None and progress.evaluated < progress.step:
             self._evaluate(last=True)
-        saved = self._save()
-        return Outcome(self.run, progress, self.evaluation, self.interrupt.number, saved)
+        return self._outcome(self._save())
+
+    def _outcome(self, saved: bool) -> Outcome:
+        number = self.interrupt.number
+        return Outcome(self.run, self.parts.progress, self.evaluations.last, number, saved)
+
+    def _resumes_exactly(self) -> bool:
+        """Whether the checkpoint holds the state of the generators that Gymnasium gives."""
+        return all(state and "bit_generator" in state for state in self._environment_states())
 
     def restore(self, start: Checkpoint) -> None:
         """Stand where the checkpoint was taken."""
@@ -185,15 +215,17 @@ class Stretch:
         self.clock = Clock(state["seconds"], state["cpu_seconds"])
         self.metrics.trim(parts.progress.step)
 
-    def _watch_for_an_end(self, moment: Moment) -> None:
-        """Rows and checkpoints wait for the end of an episode: tell, once, if none comes."""
+    def _watch_for_episode_end(self, moment: Moment) -> None:
+        """Warn, once, if no episode ends: metrics and evaluations wait for that."""
+        long = min(LONG * self.environments.count, max(1, self.config.steps // 2))
         if moment.episodes:
             self._ended = moment.step
-        elif self._ended is not None and moment.step - self._ended > LONG:
+        elif self._ended is not None and moment.step - self._ended > long:
             self._ended = None
             self.view.warn(
-                f"no episode has ended in {LONG:,} steps, and nothing is logged or saved until one "
-                "does: an environment that goes on for ever needs gymnasium.wrappers.TimeLimit"
+                f"no episode has ended in {long:,} steps, and nothing is logged or evaluated until "
+                "one does: an environment whose episodes have no end needs "
+                "gymnasium.wrappers.TimeLimit"
             )
 
     def _lost(self, what: str) -> None:
@@ -209,12 +241,12 @@ class Stretch:
             step = self.parts.progress.step
             saved = f"the run is saved at step {step:,}; go on with `{resume_line(self.run.path)}`"
             raise EnvironmentsLost(
-                f"an environment's process {what}, after {most} restarts: "
+                f"an environment's process {what}, after {counted(most, 'restart')}: "
                 + (saved if step else "the run ends before its first step")
             )
         self.view.warn(
-            f"an environment's process {what}: starting the environments again ({self.losses} of "
-            f"{most} times)"
+            f"an environment's process {what}: starting the environments again (restart "
+            f"{self.losses} of {most})"
         )
 
     def _is_to_stop(self) -> bool:
@@ -224,9 +256,7 @@ class Stretch:
         return spent or self.interrupt.number is not None
 
     def _at_episode_end(self) -> None:
-        progress, every = self.parts.progress, self.config.eval.every
-        due = progress.step // every > progress.evaluated // every
-        if due and progress.step < self.config.steps:  # the last one comes after the loop
+        if self.evaluations.are_due():
             self._evaluate()
             self._save()
         elif self._interval.is_due():
@@ -236,7 +266,10 @@ class Stretch:
         """A row of metrics for the episode that has ended."""
         self.guard.check()
         self.run.check_there()
-        values = {f"train/{k}": v for k, v in mean_metrics(moment.episodes).items()}
+        progress = self.parts.progress
+        progress.reports_success |= report_success(moment.episodes)
+        means = mean_metrics(moment.episodes, reports_success=progress.reports_success)
+        values = {f"train/{k}": v for k, v in means.items()}
         values |= self.averages.take()
         values |= self.clock.rates(self.parts.progress)
         values["replay/steps"] = float(len(self.replay))
@@ -246,44 +279,25 @@ class Stretch:
         return values
 
     def _evaluate(self, last: bool = False) -> None:
-        self.run.check_there()
-        parts, config = self.parts, self.config.eval
-        step = parts.progress.step
-        policy = Policy(parts.agent, self.config, parts.space, parts.device, step)
-        film = parts.films and (config.video == "each" or (config.video == "last" and last))
-        try:
-            self.evaluation = evaluate(
-                policy,
-                parts.eval_env,
-                config.episodes,
-                reset=policy.reset,
-                video=self.run.videos / f"{step:08d}.mp4" if film else None,
-                tick=self._evaluating,
-                warn=self.view.warn,
-            )
-        except _Interrupted:
-            return
-        self.run.check_there()
-        parts.progress.evaluated = step
-        values = {f"eval/{name}": value for name, value in self.evaluation.metrics().items()}
-        self.metrics.write(step, values | {"time/seconds": self.clock.seconds()})
-        self.view.evaluated(step, self.evaluation)
-        self.clock.mark(parts.progress)  # evaluating is not counted against the speed
+        self.evaluations.run(self._save, self.clock, last=last)
+        self.clock.mark(self.parts.progress)  # evaluating is not counted against the speed
 
-    def _evaluating(self, episode: int) -> None:
-        """Between two steps of an evaluation; it ends at once if the run is to stop."""
-        if self.interrupt.number is not None:
-            raise _Interrupted
-        self.view.evaluating(episode, self.config.eval.episodes)
-
-    def _environment_states(self) -> list[dict[str, Any] | None]:
-        """Where the environments stand; of those that are lost, where they stood last."""
+    def _environment_states(self) -> Sequence[Mapping[str, Any] | None]:
+        """Return the states of the environments; of those that are lost, the last known."""
         with suppress(Lost):
             self._states = self.environments.states()
         return self._states
 
-    def _save(self) -> bool:
-        """Write a checkpoint; that it could not be written is told, and does not stop the run.
+    def _save(self, within: bool = False) -> bool:
+        """Write a checkpoint, unless the last one is of the present state.
+
+        A checkpoint that cannot be written is a warning, and does not stop the run.
+
+        Args:
+            within: it is written within an episode that takes long.
+
+        Returns:
+            Whether a checkpoint of the present state is on the disk.
 
         Raises:
             MerlError: the run's folder is gone, or what would be saved is no longer finite.
@@ -291,7 +305,10 @@ class Stretch:
         self.guard.check()
         self.run.check_there()
         parts, progress = self.parts, self.parts.progress
-        fresh = self.evaluation is not None and progress.evaluated == progress.step
+        if self._saved == dataclasses.asdict(progress):
+            return True
+        last = self.evaluations.last
+        fresh = last is not None and progress.evaluated == progress.step
         state = {
             "progress": dataclasses.asdict(progress),
             "randomness": parts.randomness.state_dict(),
@@ -308,7 +325,7 @@ class Stretch:
                 progress.step,
                 parts.agent,
                 state,
-                score=self.evaluation.returns.mean if fresh and self.evaluation else None,
+                score=last.returns.mean if fresh and last else None,
                 keep=self.config.keep,
             )
         except OSError as error:
@@ -317,7 +334,8 @@ class Stretch:
             self.view.warn(f"the checkpoint at step {progress.step} was not written: {reason}")
             return False
         finally:
-            self._interval.saved()
+            self._interval.saved(within)
+        self._saved = dataclasses.asdict(progress)
         self.replay.settle()
         self.view.saved(progress.step)
         return True

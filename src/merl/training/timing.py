@@ -1,4 +1,8 @@
-"""What this machine needs for an update and for a step: measured once, before a run begins."""
+"""What this machine needs for an update and for a step: measured once, before a run begins.
+
+Updates and acting are timed with synthetic observations. A user's own environment is only
+timed if `TrainConfig.measure` is set: it may be a robot, which must not move before the run begins.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,8 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
-from merl.core import Batch, MerlError, is_image
+from merl.core import Batch, MerlError, counted, is_image
+from merl.networks.settings import torch_settings
 from merl.resources import allow_picture_threads
 from merl.training.config import TrainConfig
 from merl.training.loop import Update
@@ -49,7 +54,7 @@ class Arithmetic:
 
     def __str__(self) -> str:
         how = f"{self.precision}, compiled," if self.compiled else self.precision
-        return f"{how} on {self.threads} thread{'s' * (self.threads > 1)}"
+        return f"{how} on {counted(self.threads, 'thread')}"
 
     @property
     def must_gain(self) -> float:
@@ -73,12 +78,14 @@ class Timing:
             held, that is one decision.
         frame: of one picture of a video; 0 where none is made.
         not_compiled: why updates cannot be compiled, where that was tried.
+        knows_env: whether `step` includes the environment's step; if not, it is acting alone.
     """
 
     update: Mapping[Arithmetic, float]
     step: float
     frame: float = 0.0
     not_compiled: str | None = None
+    knows_env: bool = True
 
     @property
     def best(self) -> Arithmetic:
@@ -86,13 +93,17 @@ class Timing:
         return min(self.update, key=lambda how: self.update[how] * how.must_gain)
 
     def seconds(self, config: TrainConfig, done: int = 0) -> float:
-        """The time that a run will take from step `done` on, evaluation included."""
+        """Return the time that a run takes from step `done` on, evaluation included.
+
+        Without the environment's step (`knows_env`) this is a lower bound.
+        """
         steps = max(0, config.steps - done)
         repeat = config.action_repeat
         updates = (config.steps - max(done, config.seed_steps)) * config.updates_per_step
-        evaluations = max(1, steps // config.eval.every) * config.eval.episodes
+        count = config.eval.count(steps)
+        evaluations = count * config.eval.episodes
         length = 250 / repeat  # decisions of an episode, near enough for an estimate
-        videos = {"each": steps // config.eval.every or 1, "last": 1, "none": 0}[config.eval.video]
+        videos = {"each": count, "last": min(1, count), "none": 0}[config.eval.video]
         whole = max(0.0, updates) * self.update[self.best] + videos * length * self.frame
         whole += (steps / repeat + evaluations * length) * self.step
         return min(whole, (config.minutes or float("inf")) * 60)
@@ -105,9 +116,10 @@ def measure(
     space: spaces.Dict,
     device: torch.device,
 ) -> Timing:
-    """Time the environment's step, and the update in every way that the config leaves open.
+    """Time the update in every way that the config leaves open, and the environment's step.
 
-    Precision first, on one thread; then the fastest on all threads, or on a GPU compiled.
+    Precision first, on one thread; then the fastest on all threads, or on a GPU compiled. A
+    user's own environments are only touched if `config.measure` is set.
 
     Raises:
         MerlError: the update is to be compiled, and cannot be.
@@ -118,14 +130,16 @@ def measure(
         ("fp32", "bf16") if asked == "auto" else (asked,)
     )
     assert isinstance(env.action_space, spaces.Box)
-    batch = random_batch(config, space, env.action_space)  # as from replay: not on the device yet
+    with torch_settings(device):
+        batch = random_batch(config, space, env.action_space)  # as from replay: on the host
     update: dict[Arithmetic, float] = {}
 
     def attempt(arithmetic: Arithmetic) -> DDPG:
         use_threads(arithmetic.threads)
         try:
-            agent = _agent(config, space, batch, device, arithmetic)
-            update[arithmetic] = _time_update(agent, batch)
+            with torch_settings(device):
+                agent = _agent(config, space, batch, device, arithmetic)
+                update[arithmetic] = _time_update(agent, batch)
         except Exception as error:
             if arithmetic.compiled:
                 raise _CompileError(error) from error
@@ -139,9 +153,14 @@ def measure(
     if config.threads is None and cores > threads:
         attempt(dataclasses.replace(fastest, threads=cores))
     use_threads(threads)
-    films = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
-    frame = _time_frame(eval_env) if films else 0.0
-    timing = Timing(update, _time_step(env) + _time_acting(agent, batch), frame)
+    with torch_settings(device):
+        step, frame = _time_acting(agent, batch), 0.0
+    knows_env = config.measure or not config.own_env
+    if knows_env:
+        films = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
+        frame = _time_frame(eval_env) if films else 0.0
+        step += _time_step(env)
+    timing = Timing(update, step, frame, knows_env=knows_env)
     if not worth_compiling(config, timing, device):
         return timing
     print("merl: trying torch.compile, once, for a minute or two", file=sys.stderr)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from contextlib import ExitStack
 
+from merl.networks.settings import torch_settings
 from merl.replay import Lanes
 from merl.training.acting import Here, Workers
 from merl.training.checkpoint import Checkpoint
@@ -18,15 +18,16 @@ from merl.training.stretch import Outcome, Stretch, View
 
 
 def start(parts: Parts, view: View) -> Outcome:
-    """Begin a new run; if it fails before its first step, its folder is removed again."""
-    run = Run.create(parts.config, parts.space, parts.action_space, own_bounds(parts.env))
-    try:
-        with run.lock():
+    """Begin a new run; if it fails before its first step, nothing is left of it."""
+    bounds = own_bounds(parts.env)
+    space, actions, names = parts.space, parts.action_space, parts.left_open
+    with Run.begin(parts.config, space, actions, bounds, names, home=parts.home) as run:
+        try:
             return _train(parts, run, None, view)
-    except BaseException:
-        if parts.progress.step == 0:
-            shutil.rmtree(run.path, ignore_errors=True)
-        raise
+        except BaseException:
+            if parts.progress.step == 0:
+                run.discard()
+            raise
 
 
 def resume(parts: Parts, run: Run, point: Checkpoint | None, view: View) -> Outcome:
@@ -42,14 +43,15 @@ def _train(parts: Parts, run: Run, point: Checkpoint | None, view: View) -> Outc
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt().listening())
         metrics = stack.enter_context(MetricsWriter(run.path, view.warn))
-        replay = Lanes(
-            config.replay,
-            parts.space,
-            parts.action_space,
-            count=config.num_envs,
-            directory=run.replay,
-            capacity=config.capacity,
-        )
+        with torch_settings(parts.device):
+            replay = Lanes(
+                config.replay,
+                parts.space,
+                parts.action_space,
+                count=config.num_envs,
+                directory=run.replay,
+                capacity=config.capacity,
+            )
         with interrupt.raising():
             environments = Workers(config, parts.env) if config.has_workers else Here(parts.env)
         stack.callback(environments.close)
@@ -57,4 +59,5 @@ def _train(parts: Parts, run: Run, point: Checkpoint | None, view: View) -> Outc
         if point is not None:
             stretch.restore(point)
             run.record_resumption(point.step)
-        return stretch.train()
+        outcome = stretch.train()
+    return dataclasses.replace(outcome, unwritten=metrics.unwritten)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from merl.agents.ddpg import DDPG
 from merl.core import Batch
+from merl.networks.settings import torch_settings
 from merl.replay import Lanes
 from merl.replay.on_device import OnDevice, bytes_on_device
 from merl.training.config import TrainConfig
@@ -45,7 +46,10 @@ def make_update(
     warn: Callable[[str], None],
     updates: int = 0,
 ) -> Update:
-    """What learns fastest where the agent lives.
+    """Make the update that is fastest where the agent lives.
+
+    The environments may share this process: whatever they have set in torch, batch and update are
+    made with merl's settings.
 
     Args:
         agent: the learner.
@@ -55,6 +59,24 @@ def make_update(
         warn: is told why a GPU does not hold the replay.
         updates: that were made so far.
     """
+    with torch_settings(agent.device, agent.threads):
+        update = _fastest_update(agent, replay, randomness, config, warn, updates)
+
+    def update_with_settings() -> dict[str, Tensor]:
+        with torch_settings(agent.device, agent.threads):
+            return update()
+
+    return update_with_settings
+
+
+def _fastest_update(
+    agent: DDPG,
+    replay: Lanes,
+    randomness: Randomness,
+    config: TrainConfig,
+    warn: Callable[[str], None],
+    updates: int,
+) -> Update:
     if agent.device.type == "cuda":
         torch.cuda.empty_cache()  # what was timed is gone, but torch keeps its memory
         if config.replay.compress:

@@ -146,7 +146,7 @@ class VideoWriter:
         """Give the video up and remove what there is of it."""
         container, self._container = self._container, None
         if container is not None:
-            with contextlib.suppress(OSError):  # the reason is known, or does not matter any more
+            with contextlib.suppress(Exception):  # the reason is known, or does not matter any more
                 container.close()
         with contextlib.suppress(OSError):
             self._part.unlink(missing_ok=True)

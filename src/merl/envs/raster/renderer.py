@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.envs.raster_scene import Scene, build_scene
+from merl.envs.raster.scene import Scene, build_scene
 from merl.envs.ray_tracing import start_warp, told_if_it_takes_long
 
 SHADOW_TEXELS = 1.5
@@ -40,7 +40,7 @@ class RasterRenderer:
         self, physics: Any, camera: str, size: int, samples: int = 1, device: str = "cpu"
     ) -> None:
         start_warp()
-        self._wp, self._kernels = import_module("warp"), import_module("merl.envs.raster_kernels")
+        self._wp, self._structs = import_module("warp"), import_module("merl.envs.raster.structs")
         self._model, self._data = physics.model.ptr, physics.data.ptr
         self._camera = self._model.camera(camera).id
         self._samples, self._side, self._device = samples, size * samples, device
@@ -80,7 +80,7 @@ class RasterRenderer:
         """Nothing to do: the arrays go with the renderer."""
 
     def _allocate(self, size: int) -> None:
-        k, scene = self._kernels, self._scene
+        k, scene = self._structs, self._scene
         views, pixels, shadows = 1 + len(self._shadows), self._side**2, len(self._shadows)
         wp = self._wp
         shapes: dict[str, tuple[Any, Any]] = {
@@ -111,7 +111,7 @@ class RasterRenderer:
         return self._wp.array(values, dtype=dtype, device=self._device)
 
     def _fill_surfaces(self, scene: Scene) -> Any:
-        wp, k = self._wp, self._kernels
+        wp, k = self._wp, self._structs
         surfaces = k.Surfaces()
         vec3, vec3i = wp.vec3, wp.vec3i
         for name, dtype in {
@@ -144,7 +144,7 @@ class RasterRenderer:
 
     def _describe_views(self) -> None:
         """What does not move of the camera and the lights; `_aim` sets the rest."""
-        model, k = self._model, self._kernels
+        model, k = self._model, self._structs
         near = model.vis.map.znear * model.stat.extent
         self._view_rows = np.zeros(1 + len(self._shadows), k.View.numpy_dtype())
         self._light_rows = np.zeros(len(self._scene.lights), k.Light.numpy_dtype())
@@ -170,7 +170,10 @@ class RasterRenderer:
 
     def _record(self) -> dict[str, Any]:
         """Every launch, recorded once: replaying one takes microseconds."""
-        k, wp, a = self._kernels, self._wp, self._arrays
+        wp, a = self._wp, self._arrays
+        covering, shading = (
+            import_module(f"merl.envs.raster.{name}") for name in ("cover", "shade")
+        )
         scene, surfaces = self._scene, self._surfaces
         frames = [a.views, a.pose, a.offset]
 
@@ -182,13 +185,13 @@ class RasterRenderer:
         views, vertices = 1 + len(self._shadows), len(scene.vertices)
         commands = {
             "place": launch(
-                k.place_geoms,
+                covering.place_geoms,
                 (views, len(scene.drawn)),
                 *(surfaces, a.views, a.positions, a.rotations),
                 *(a.pose, a.offset, a.eyes),
             ),
             "paint": launch(
-                k.paint_background,
+                shading.paint_background,
                 (self._side, self._side),
                 *(
                     surfaces,
@@ -199,9 +202,9 @@ class RasterRenderer:
                 ),
                 *(self._samples, a.behind, a.shadowed),
             ),
-            "project": launch(k.project, (views, vertices), surfaces, *frames, a.projected),
+            "project": launch(covering.project, (views, vertices), surfaces, *frames, a.projected),
             "cover": launch(
-                k.cover,
+                covering.cover,
                 len(scene.triangles),
                 *(
                     surfaces,
@@ -213,7 +216,7 @@ class RasterRenderer:
                 ),
             ),
             "shade": launch(
-                k.shade,
+                shading.shade,
                 a.colors.shape[:2],
                 *(
                     surfaces,
@@ -232,7 +235,7 @@ class RasterRenderer:
                 ),
             ),
             "measure": launch(
-                k.measure,
+                shading.measure,
                 a.depth.shape,
                 *(
                     surfaces,
@@ -246,7 +249,7 @@ class RasterRenderer:
         }
         for n in range(len(self._shadows)):
             commands[f"shadow {n}"] = launch(
-                k.cover,
+                covering.cover,
                 len(scene.triangles),
                 *(surfaces, *frames, a.eyes, a.projected, 1 + n),
                 a.maps[n].reshape(-1),

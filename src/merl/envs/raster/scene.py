@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.envs.raster_shapes import Shape, shape_of
-from merl.envs.raster_textures import Textures, pixels
+from merl.envs.raster.shapes import Shape, shape_of
+from merl.envs.raster.textures import Textures, pixels
 
 DRAWN_GROUPS = 3
 """Geoms of the groups below this are drawn, as MuJoCo does by default."""

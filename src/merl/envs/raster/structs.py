@@ -1,0 +1,108 @@
+"""Structures that the rasteriser's Warp kernels share.
+
+Conventions: a view looks along -z with +x to the right and +y up, as a MuJoCo camera does. The
+depth of a point is its distance along the viewing direction, in metres; the buffers compare
+1 / depth. Of what each view has, the camera's comes first.
+"""
+
+import warp as wp
+
+
+@wp.struct
+class View:
+    """A pinhole camera, or a light seen as one.
+
+    `eye` and `axes` (columns: right, up, backward) are in the world's frame; `focal` is in pixels,
+    `size` is the number of samples along an edge; orthographic views have `ortho` = 1 and `focal`
+    samples per metre.
+    """
+
+    eye: wp.vec3
+    axes: wp.mat33
+    focal: float
+    size: int
+    near: float
+    ortho: int
+
+
+@wp.struct
+class Light:
+    """A light of the model; angles as cosines."""
+
+    position: wp.vec3
+    direction: wp.vec3
+    ambient: wp.vec3
+    diffuse: wp.vec3
+    specular: wp.vec3
+    attenuation: wp.vec3
+    cutoff: float
+    exponent: float
+    directional: int
+    shiny: int  # has a specular colour
+    shadow: int  # index of its shadow map, -1 without
+
+
+@wp.struct
+class Material:
+    """How a surface reflects light; `texture` is the index of its first mipmap level, or -1."""
+
+    color: wp.vec3
+    emission: float
+    specular: float
+    shininess: float
+    dull: float  # below this cosine the highlight is invisible
+    texture: int
+    levels: int
+    repeat: wp.vec2
+
+
+@wp.struct
+class Level:
+    """One mipmap level: where its texels start, and how many there are."""
+
+    start: int
+    width: int
+    height: int
+
+
+@wp.struct
+class Surfaces:
+    """What can be hit, as `raster_scene.Scene`: triangles, planes, and what they look like."""
+
+    drawn: wp.array(dtype=int)  # the model's geoms that are drawn; all other geoms count in these
+    vertices: wp.array(dtype=wp.vec3)
+    geom_of_vertex: wp.array(dtype=int)
+    triangles: wp.array(dtype=wp.vec3i)
+    geom_of: wp.array(dtype=int)
+    facing: wp.array(dtype=wp.vec4)  # of a triangle's plane: above 0 for points in front of it
+    normals: wp.array(dtype=wp.vec3)
+    normal_of: wp.array(dtype=wp.vec3i)
+    coordinates: wp.array(dtype=wp.vec2)
+    coordinate_of: wp.array(dtype=wp.vec3i)
+    density: wp.array(dtype=float)  # texels per metre
+    planes: wp.array(dtype=int)
+    plane_sizes: wp.array(dtype=wp.vec2)  # half of each edge, m; infinite if not above 0
+    materials: wp.array(dtype=Material)
+    texels: wp.array(dtype=wp.vec3)
+    levels: wp.array(dtype=Level)
+    sky: int  # the level with the sky's cube map, -1 without
+
+
+@wp.struct
+class Background:
+    """A sample of what lies behind all triangles: a plane (its geom) or the sky (geom -1).
+
+    `color` is what the lights without a shadow map give.
+    """
+
+    color: wp.vec3
+    inverse: float
+    geom: int
+
+
+@wp.struct
+class Shadowed:
+    """What a light with a shadow map adds to a sample, and where its map says whether it does."""
+
+    color: wp.vec3
+    where: wp.vec3

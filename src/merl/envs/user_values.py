@@ -1,0 +1,139 @@
+"""Values that a user's environment returns, checked and converted to plain Python and NumPy types.
+
+Every function that refuses a value raises `EnvironmentFailed` with one line that names the value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merl.core import EnvironmentFailed
+
+_LONGEST = 80
+"""Characters of a value that a message shows."""
+
+
+def shown(value: Any) -> str:
+    """A value in one short line, for a message."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # the user's own __repr__ may fail
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def to_array(name: str, value: Any) -> NDArray[Any]:
+    """Convert a value to an array of numbers or booleans; tensors are copied to the host.
+
+    Args:
+        name: what the value is, for the message.
+        value: an array, a tensor of any device, a number, or nested lists of these.
+
+    Raises:
+        EnvironmentFailed: NumPy cannot convert it, or it holds something other than real numbers.
+    """
+    try:
+        try:
+            array = np.asarray(value)
+        except Exception:  # a tensor with gradients, or on another device
+            array = np.asarray(_on_host(value))
+    except Exception as error:  # conversion is the code of whichever library made the value
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise EnvironmentFailed(
+            f"{name} cannot be converted to an array of numbers ({reason}): it is {shown(value)}"
+        ) from None
+    if array.dtype.kind not in "biuf":
+        raise EnvironmentFailed(f"{name} holds what is no number: {shown(value)}")
+    return array
+
+
+def to_number(name: str, value: Any) -> float:
+    """Convert a number, or an array of exactly one, to a float.
+
+    Raises:
+        EnvironmentFailed: it is something else.
+    """
+    try:
+        array = to_array(name, value)
+    except EnvironmentFailed:
+        raise EnvironmentFailed(
+            f"the environment's {name} is {shown(value)}: it must be a number"
+        ) from None
+    if array.size != 1:
+        raise EnvironmentFailed(
+            f"the environment's {name} is {shown(value)}, {array.size} values: it must be a "
+            "number, for example their weighted sum"
+        )
+    return float(array.item())
+
+
+def to_bool(name: str, value: Any) -> bool:
+    """Convert a bool, 0, 1, or an array of exactly one of these, to a bool.
+
+    Raises:
+        EnvironmentFailed: it is something else; a string or NaN would be true for Python.
+    """
+    try:
+        array = to_array(name, value)
+    except EnvironmentFailed:
+        array = np.empty(0)
+    if array.size != 1 or array.item() not in (0, 1):
+        raise EnvironmentFailed(
+            f"the environment's {name} is {shown(value)}: it must be true or false (or 1 or 0)"
+        )
+    return bool(array.item())
+
+
+def to_info(info: Any) -> dict[str, Any]:
+    """Copy `info`, with `success` as a bool and `reward_terms` as numbers, where it has them.
+
+    `is_success` is another name for `success`; both may be a dict with the key `task`.
+
+    Raises:
+        EnvironmentFailed: it is not a dict, or one of these has another form.
+    """
+    if not isinstance(info, Mapping):
+        raise EnvironmentFailed(f"the environment's info is {shown(info)}: it must be a dict")
+    checked = dict(info)
+    for key in ("success", "is_success"):
+        if key in info:
+            checked["success"] = _success(key, info[key])
+            break
+    if "reward_terms" in info:
+        terms = info["reward_terms"]
+        if not isinstance(terms, Mapping):
+            raise EnvironmentFailed(
+                f'the environment\'s info["reward_terms"] is {shown(terms)}: it must be a dict of '
+                "numbers"
+            )
+        checked["reward_terms"] = {
+            str(name): to_number(f"reward term {name!r}", value) for name, value in terms.items()
+        }
+    return checked
+
+
+def _success(key: str, value: Any) -> bool:
+    name = f'info["{key}"]'
+    if isinstance(value, Mapping):
+        if "task" not in value:
+            raise EnvironmentFailed(
+                f"the environment's {name} is {shown(value)}: a dict needs the key 'task', true or "
+                "false"
+            )
+        name, value = f'{name}["task"]', value["task"]
+    return to_bool(name, value)
+
+
+def _on_host(value: Any) -> Any:
+    """Replace torch tensors, also in lists, by arrays: without gradients, in the host's memory."""
+    if isinstance(value, list | tuple):
+        return [_on_host(part) for part in value]
+    if not callable(getattr(value, "detach", None)):
+        return value
+    tensor = value.detach().cpu()
+    # NumPy has no bfloat16; float32 holds each of its values.
+    return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()

@@ -1,0 +1,131 @@
+"""Random generators that an environment may use, beside Gymnasium's `np_random`.
+
+The global generators of NumPy, Python and torch belong to the whole process. They are seeded with
+the seed of an episode wherever one is given, saved in checkpoints, and an evaluation leaves them,
+and the generators of its environment, as they were.
+"""
+
+from __future__ import annotations
+
+import base64
+import random
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+
+
+def seed_global_generators(seed: int) -> None:
+    """Seed the global generators of NumPy, Python and torch."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 (the one that environments use)
+    torch.manual_seed(seed)
+
+
+def global_state() -> dict[str, Any]:
+    """Return the state of the global generators as plain types, for JSON."""
+    version, words, gauss = random.getstate()
+    numpy: dict[str, Any] = dict(np.random.get_state(legacy=False))  # noqa: NPY002
+    numpy["state"] = {
+        name: part.tolist() if isinstance(part, np.ndarray) else part
+        for name, part in numpy["state"].items()
+    }
+    return {
+        "python": [version, list(words), gauss],
+        "numpy": numpy,
+        "torch": base64.b64encode(torch.get_rng_state().numpy().tobytes()).decode(),
+    }
+
+
+def set_global_state(state: Mapping[str, Any]) -> None:
+    """Restore the global generators from `global_state()`."""
+    version, words, gauss = state["python"]
+    random.setstate((version, tuple(words), gauss))
+    np.random.set_state({**state["numpy"]})  # noqa: NPY002
+    data = bytearray(base64.b64decode(state["torch"]))
+    torch.set_rng_state(torch.frombuffer(data, dtype=torch.uint8))
+
+
+@contextmanager
+def kept_generators(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
+    """Restore random generators at the end: the global ones, and those of an environment.
+
+    The environment's are those that it holds as attributes: of each wrapper, of the environment
+    itself, of their classes, modules and spaces. This includes the environment that is trained in,
+    where both are one object or share a generator.
+    """
+    restore = [*_restorers(env)]
+    shared = global_state()
+    on_cuda = torch.cuda.is_available() and torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    cuda = torch.cuda.get_rng_state() if on_cuda else None
+    try:
+        yield
+    finally:
+        for put_back in restore:
+            put_back()
+        set_global_state(shared)
+        if cuda is not None:
+            torch.cuda.set_rng_state(cuda)
+
+
+def _restorers(env: gymnasium.Env[Any, Any]) -> Iterator[Callable[[], object]]:
+    """For each generator that the environment holds, a function that restores it."""
+    for owner in _owners(env):
+        for name, value in list(getattr(owner, "__dict__", {}).items()):
+            restore = _restorer(value)
+            if restore is not None:
+                yield restore
+            if restore is not None or name == "_np_random":  # a space's is None until it is used
+                yield _reassign(owner, name, value)
+
+
+def _owners(env: gymnasium.Env[Any, Any]) -> Iterator[Any]:
+    """Objects whose attributes may be generators of an environment."""
+    layer: Any = env
+    while layer is not None:
+        yield layer
+        yield from type(layer).__mro__
+        yield sys.modules.get(type(layer).__module__)
+        for value in getattr(layer, "__dict__", {}).values():
+            yield from _with_parts(value)
+        layer = layer.env if isinstance(layer, gymnasium.Wrapper) else None
+
+
+def _with_parts(value: Any) -> Iterator[Any]:
+    """A space and the spaces in it; nothing for any other object."""
+    if isinstance(value, spaces.Space):
+        yield value
+        for part in value.spaces.values() if isinstance(value, spaces.Dict) else ():
+            yield from _with_parts(part)
+
+
+def _restorer(value: Any) -> Callable[[], object] | None:
+    """A function that sets a generator back to its present state; None for other objects."""
+    if isinstance(value, np.random.Generator):
+        bits, state = value.bit_generator, value.bit_generator.state
+        return lambda: setattr(bits, "state", state)
+    if isinstance(value, np.random.RandomState):
+        legacy = value.get_state(legacy=False)
+        return lambda: value.set_state(legacy)
+    if isinstance(value, random.Random) and not isinstance(value, random.SystemRandom):
+        words = value.getstate()
+        return lambda: value.setstate(words)
+    if isinstance(value, torch.Generator):
+        tensor = value.get_state()
+        return lambda: value.set_state(tensor)
+    return None
+
+
+def _reassign(owner: Any, name: str, value: Any) -> Callable[[], None]:
+    """A function that makes a generator the owner's again: `reset(seed=...)` may replace it."""
+
+    def reassign() -> None:
+        if owner.__dict__.get(name) is not value:
+            setattr(owner, name, value)
+
+    return reassign

@@ -123,19 +123,25 @@ def _warp_on_cpu() -> Iterator[None]:
 
 
 def _start_warp() -> Any:
-    """The module mujoco_warp, with Warp silenced and a place for its compiled kernels."""
+    """Return the module mujoco_warp, with Warp silenced and a place for its compiled kernels."""
     with _warp_lock:
-        if "mujoco_warp" not in sys.modules:
-            import warp
-
-            warp.config.log_level = warp.LOG_ERROR
-            warp.config.kernel_cache_dir = str(_kernel_cache())
-            flags = warp.config.cpu_compiler_flags
-            own = "-march=native" if flags is None else flags  # None: for this processor, too
-            warp.config.cpu_compiler_flags = f"{own} {_COMPILER_FLAGS}"
-            with _silent_stderr():  # without an NVIDIA driver Warp says so, past Python
-                warp.init()  # type: ignore[no-untyped-call]
+        _configure_warp()
         return importlib.import_module("mujoco_warp")
+
+
+@cache
+def _configure_warp() -> None:
+    """Configure Warp, once in a process, whether or not another module has imported it before."""
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR
+    if warp.config.kernel_cache_dir is None:  # else a program that uses merl has chosen
+        warp.config.kernel_cache_dir = str(_kernel_cache())
+    flags = warp.config.cpu_compiler_flags
+    own = "-march=native" if flags is None else flags  # None: for this processor, too
+    warp.config.cpu_compiler_flags = f"{own} {_COMPILER_FLAGS}"
+    with _silent_stderr():  # without an NVIDIA driver Warp says so, past Python
+        warp.init()  # type: ignore[no-untyped-call]
 
 
 @contextmanager

@@ -161,7 +161,7 @@ def signalled(tmp_path: Path, numbers: list[int]) -> None:
         assert process.returncode == 128 + number, err
         assert "Traceback" not in err
         assert f"merl resume {folder}" in flat(out)
-    assert main(["resume", str(folder), "--steps", str(saved(folder)[-1] + 10)]) == 0
+    assert main(["resume", str(folder), "--steps", str(saved(folder)[-1] + 100)]) == 0
     steps = read_metrics(folder)["step"]
     assert (np.diff(steps) > 0).all()
 

@@ -19,7 +19,8 @@ def test_both_sides_are_timed():
     shown = flat(capture.get())
     for side in (bench.RAW, bench.COMPRESSED):
         assert side in shown
-        assert 0 < result["sample_ms"][side]["median"] <= result["ready_ms"][side]["high"]
+        assert result["sample_ms"][side]["median"] > 0
+        assert result["ready_ms"][side]["median"] > 0
         assert result["gigabytes"][side] <= bench.BARS_GB[side]
     assert result["picture_bytes"][bench.COMPRESSED] < result["picture_bytes"][bench.RAW] / 4
 

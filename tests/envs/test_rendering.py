@@ -12,7 +12,7 @@ import pytest
 from dm_control import manipulation
 
 from merl.core import MerlError
-from merl.envs import make_env, ray_tracing
+from merl.envs import make_env, warp_runtime
 from merl.envs.rendering import check_renderer
 from merl.resources import allow_picture_threads
 
@@ -278,21 +278,21 @@ def test_gl_after_warp_in_one_process(opengl, warp_env):
 
 def test_it_is_said_that_the_ray_tracer_is_compiled(capsys):
     said, shown = "merl: compiling the renderer, once, for 5 to 20 s\n", ""
-    with ray_tracing.told_if_it_takes_long(0.1):
+    with warp_runtime.told_if_it_takes_long(0.1):
         while not shown:  # as compiling does, this takes processor time
             shown = capsys.readouterr().err
     assert shown == said
 
 
 def test_on_a_busy_machine_loading_is_not_called_compiling(capsys):
-    with ray_tracing.told_if_it_takes_long(0.2) as watch:
+    with warp_runtime.told_if_it_takes_long(0.2) as watch:
         time.sleep(0.5)  # another process has the processor
     watch.join()
     assert capsys.readouterr().err == ""
 
 
 def test_warp_works_without_a_home(tmp_path):
-    code = "from merl.envs import ray_tracing; ray_tracing._start_warp(); import warp;"
+    code = "from merl.envs import warp_runtime; warp_runtime.start_warp(); import warp;"
     code += "print(warp.config.kernel_cache_dir)"
     home = tmp_path / "a file, so that no folder can be made in it"
     home.touch()

@@ -47,7 +47,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.setattr(
         "merl.training.parts.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
     )
-    monkeypatch.setattr("merl.cli.summary.learning_curve", lambda run, to, **_: to)
+    monkeypatch.setattr("merl.report.figures.learning_curve", lambda run, to, **_: to)
     yield
     unruly.__dict__.update(DEFAULT)
     unruly_envs.made.clear()
@@ -187,8 +187,8 @@ def test_a_report_that_fails_costs_nothing(
     def broken(*_: Any, **__: Any) -> None:
         raise MemoryError
 
-    for part in ("learning_curve", "floors"):
-        monkeypatch.setattr(f"merl.cli.summary.{part}", broken)
+    for part in ("report.figures.learning_curve", "cli.summary.floors"):
+        monkeypatch.setattr(f"merl.{part}", broken)
     assert train("--eval.references") == 0
     said = capsys.readouterr().out
     assert "the curve was not drawn: MemoryError" in said

@@ -359,7 +359,7 @@ def test_a_worker_compares_its_instance_with_the_first(monkeypatch: pytest.Monke
     config = compose("smoke", f"{here}:Changing")
     expected = EnvSpaces.of(config, make_run_env(config))
     monkeypatch.setattr("signal.signal", lambda *_: None)
-    worker = _Maker(config, 1, expected, None)()
+    worker = _Maker(config, 1, expected, None, None)()
     assert worker.observation_space == expected.observation
     with pytest.raises(MerlError, match="and that of worker 1: the actions' bounds"):
         worker.reset()

@@ -28,9 +28,9 @@ class EnvConfig:
     """How an environment is seen."""
 
     renderer: RendererChoice = "auto"
-    """What draws the pictures: `gl` (OpenGL, as dm_control does), `warp` (a ray tracer that needs no
-    OpenGL and is much faster on a CPU) or `raster` (a z-buffer, four times as fast as `warp` and
-    nearer to `gl`). To an agent they are different cameras. `auto` is replaced by `warp`."""
+    """What draws the pictures: `gl` (OpenGL, as dm_control does), `warp` (a ray tracer that needs
+    no OpenGL and is much faster on a CPU) or `raster` (a z-buffer, four times as fast as `warp`
+    and nearer to `gl`). To an agent they are different cameras. `auto` is replaced by `warp`."""
 
     image_size: int = 84
     """Height and width of the agent's picture, in pixels; from 16 to 2048."""

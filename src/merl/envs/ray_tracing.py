@@ -1,25 +1,19 @@
-"""Pictures by rays: `renderer="warp"`, and how Warp is started."""
+"""Pictures by rays: `renderer="warp"`."""
 
 from __future__ import annotations
 
 import importlib
 import os
-import sys
-import tempfile
-import threading
-import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
 from copy import copy
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from merl.envs.warp_runtime import start_warp, told_if_it_takes_long, warp_on_cpu
 from merl.resources import MOST_PICTURE_THREADS, picture_threads
 
 
@@ -31,10 +25,11 @@ class WarpRenderer:
     """
 
     def __init__(self, physics: Any, camera: str, size: int) -> None:
-        self._mjw = start_warp()
+        start_warp()
+        self._mjw = importlib.import_module("mujoco_warp")
         self._source = physics.data.ptr
         model = physics.model.ptr
-        with _warp_on_cpu(), told_if_it_takes_long():
+        with warp_on_cpu(), told_if_it_takes_long():
             self._model = self._mjw.put_model(model)
             self._data = self._mjw.put_data(model, self._source)
             self._context = self._mjw.create_render_context(
@@ -62,7 +57,7 @@ class WarpRenderer:
         for name, pose in self._poses.items():
             pose[:] = getattr(self._source, name).reshape(pose.shape)
         threads = min(picture_threads(), len(self._bgra))
-        with _warp_on_cpu():
+        with warp_on_cpu():
             if len(self._parts) != threads:
                 self._parts = _shared_out(self._context, threads)
             self._mjw.refit_bvh(self._model, self._data, self._context)
@@ -108,85 +103,3 @@ os.register_at_fork(after_in_child=lambda: _helpers.cache_clear())  # threads ar
 
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
 """What moves from one picture to the next."""
-_COMPILER_FLAGS = "-menable-no-nans -fno-signed-zeros -Wno-nan-infinity-disabled"
-"""A quarter of the time, pixel for pixel the same picture: nothing there is ever NaN."""
-_warp_lock = threading.RLock()
-
-
-@contextmanager
-def _warp_on_cpu() -> Iterator[None]:
-    """Run Warp on the CPU; one thread at a time, for the device is a setting of the process."""
-    import warp
-
-    with _warp_lock, warp.ScopedDevice("cpu"):
-        yield
-
-
-def start_warp() -> Any:
-    """The module mujoco_warp, with Warp silenced and a place for its compiled kernels."""
-    with _warp_lock:
-        if "mujoco_warp" not in sys.modules:
-            import warp
-
-            warp.config.log_level = warp.LOG_ERROR
-            warp.config.kernel_cache_dir = str(_kernel_cache())
-            flags = warp.config.cpu_compiler_flags
-            own = "-march=native" if flags is None else flags  # None: for this processor, too
-            warp.config.cpu_compiler_flags = f"{own} {_COMPILER_FLAGS}"
-            with _silent_stderr():  # without an NVIDIA driver Warp says so, past Python
-                warp.init()  # type: ignore[no-untyped-call]
-        return importlib.import_module("mujoco_warp")
-
-
-@contextmanager
-def told_if_it_takes_long(seconds: float = 2.0) -> Iterator[threading.Thread]:
-    """Say that the renderer is being compiled, if this takes more than `seconds`.
-
-    They are seconds of processor time: to load what is compiled already takes fewer, also on a busy
-    machine.
-    """
-    begin, is_over = time.process_time(), threading.Event()
-
-    def watch() -> None:
-        while not is_over.wait(0.1):
-            if time.process_time() - begin > seconds:
-                print("merl: compiling the renderer, once, for 5 to 20 s", file=sys.stderr)
-                return
-
-    watching = threading.Thread(target=watch, daemon=True)
-    watching.start()
-    try:
-        yield watching
-    finally:
-        is_over.set()
-
-
-def _kernel_cache() -> Path:
-    """A folder of our own that can be written: in the user's cache, else among temporary files."""
-    places = [Path(tempfile.gettempdir()) / f"merl-warp-{os.getuid()}"]
-    with suppress(RuntimeError):  # there may be no home
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        places.insert(0, home / "merl" / "warp")
-    if "WARP_CACHE_PATH" in os.environ:
-        places.insert(0, Path(os.environ["WARP_CACHE_PATH"]))
-    for place in places:
-        with suppress(OSError):
-            place.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=place):
-                if place.stat().st_uid == os.getuid():  # code is loaded from here
-                    return place
-    return Path(tempfile.mkdtemp(prefix="merl-warp-"))
-
-
-@contextmanager
-def _silent_stderr() -> Iterator[None]:
-    """Send what C libraries write to stderr nowhere."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        with Path(os.devnull).open("w") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)

@@ -37,7 +37,7 @@ def torch_settings(device: torch.device, threads: int | None = None) -> Iterator
             stack.enter_context(torch.device("cpu"))
         if not torch.is_grad_enabled() or torch.is_inference_mode_enabled():
             stack.enter_context(torch.inference_mode(False))  # this enables gradients, too
-        if torch.is_autocast_enabled(device.type):
+        if device.type != "meta" and torch.is_autocast_enabled(device.type):
             stack.enter_context(torch.autocast(device.type, enabled=False))
         if torch.are_deterministic_algorithms_enabled():
             warn_only = torch.is_deterministic_algorithms_warn_only_enabled()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.envs.raster.scene import Scene, build_scene
-from merl.envs.ray_tracing import start_warp, told_if_it_takes_long
+from merl.envs.warp_runtime import start_warp, told_if_it_takes_long
 
 SHADOW_TEXELS = 1.5
 """Texels along an edge of a shadow map for each pixel along an edge of the image."""
@@ -39,8 +39,7 @@ class RasterRenderer:
     def __init__(
         self, physics: Any, camera: str, size: int, samples: int = 1, device: str = "cpu"
     ) -> None:
-        start_warp()
-        self._wp, self._structs = import_module("warp"), import_module("merl.envs.raster.structs")
+        self._wp, self._structs = start_warp(), import_module("merl.envs.raster.structs")
         self._model, self._data = physics.model.ptr, physics.data.ptr
         self._camera = self._model.camera(camera).id
         self._samples, self._side, self._device = samples, size * samples, device

@@ -55,20 +55,21 @@ def project(
     out: wp.array2d(dtype=wp.vec3),
 ):
     """Each vertex as (column, row, 1 / depth); 1 / depth <= 0 marks one before the near plane."""
-    v, i = wp.tid()
-    view = views[v]
-    g = surfaces.geom_of_vertex[i]
-    p = rotations[v, g] * surfaces.vertices[i] + offsets[v, g]
+    v, n = wp.tid()
+    view, part = views[v], surfaces.vertex_parts[n]
+    rotation, offset = rotations[v, part[0]], offsets[v, part[0]]
     half = 0.5 * float(view.size)
-    if view.ortho == 1:
-        out[v, i] = wp.vec3(half + view.focal * p[0], half - view.focal * p[1], in_line(p[2]))
-    elif -p[2] < view.near:
-        out[v, i] = wp.vec3(0.0, 0.0, -1.0)
-    else:
-        inverse = -1.0 / p[2]
-        out[v, i] = wp.vec3(
-            half + view.focal * p[0] * inverse, half - view.focal * p[1] * inverse, inverse
-        )
+    for i in range(part[1], part[2]):
+        p = rotation * surfaces.vertices[i] + offset
+        if view.ortho == 1:
+            out[v, i] = wp.vec3(half + view.focal * p[0], half - view.focal * p[1], in_line(p[2]))
+        elif -p[2] < view.near:
+            out[v, i] = wp.vec3(0.0, 0.0, -1.0)
+        else:
+            inverse = -1.0 / p[2]
+            out[v, i] = wp.vec3(
+                half + view.focal * p[0] * inverse, half - view.focal * p[1] * inverse, inverse
+            )
 
 
 @wp.func
@@ -132,6 +133,40 @@ def on_near_plane(p: wp.vec3, q: wp.vec3, view: View) -> wp.vec3:
     )
 
 
+@wp.func
+def draw_clipped(
+    surfaces: Surfaces,
+    view: View,
+    rotation: wp.mat33,
+    offset: wp.vec3,
+    projected: wp.array2d(dtype=wp.vec3),
+    v: int,
+    t: int,
+    keys: wp.array(dtype=Any),
+):
+    """Draw what lies behind the near plane of a triangle that crosses it."""
+    corners = surfaces.triangles[t]
+    # Turn the triangle until its first corner is in front and its last is behind.
+    i, j, k = corners[0], corners[1], corners[2]
+    for _ in range(2):
+        if not (projected[v, i][2] > 0.0 and projected[v, k][2] <= 0.0):
+            first = i
+            i = j
+            j = k
+            k = first
+    p = rotation * surfaces.vertices[i] + offset
+    q = rotation * surfaces.vertices[j] + offset
+    r = rotation * surfaces.vertices[k] + offset
+    start = projected[v, i]
+    end = on_near_plane(r, p, view)
+    if projected[v, j][2] > 0.0:
+        corner = on_near_plane(r, q, view)
+        draw_triangle(start, projected[v, j], corner, t, view.size, keys)
+        draw_triangle(start, corner, end, t, view.size, keys)
+    else:
+        draw_triangle(start, on_near_plane(q, p, view), end, t, view.size, keys)
+
+
 @wp.kernel
 def cover(
     surfaces: Surfaces,
@@ -144,35 +179,18 @@ def cover(
     keys: wp.array(dtype=Any),
 ):
     """Write each triangle where it is the nearest so far; clip what crosses the near plane."""
-    t = wp.tid()
-    g = surfaces.geom_of[t]
-    if wp.dot(surfaces.facing[t], eyes[v, g]) <= 0.0:  # seen from behind
-        return
-    corners = surfaces.triangles[t]
-    a = projected[v, corners[0]]
-    b = projected[v, corners[1]]
-    c = projected[v, corners[2]]
-    size = views[v].size
-    if a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0:
-        draw_triangle(a, b, c, t, size, keys)
-    elif a[2] > 0.0 or b[2] > 0.0 or c[2] > 0.0:
-        view = views[v]
-        # Turn the triangle until its first corner is in front and its last is behind.
-        i, j, k = corners[0], corners[1], corners[2]
-        for _ in range(2):
-            if not (projected[v, i][2] > 0.0 and projected[v, k][2] <= 0.0):
-                first = i
-                i = j
-                j = k
-                k = first
-        p = rotations[v, g] * surfaces.vertices[i] + offsets[v, g]
-        q = rotations[v, g] * surfaces.vertices[j] + offsets[v, g]
-        r = rotations[v, g] * surfaces.vertices[k] + offsets[v, g]
-        start = projected[v, i]
-        end = on_near_plane(r, p, view)
-        if projected[v, j][2] > 0.0:
-            corner = on_near_plane(r, q, view)
-            draw_triangle(start, projected[v, j], corner, t, size, keys)
-            draw_triangle(start, corner, end, t, size, keys)
-        else:
-            draw_triangle(start, on_near_plane(q, p, view), end, t, size, keys)
+    part = surfaces.triangle_parts[wp.tid()]
+    g = part[0]
+    eye, size = eyes[v, g], views[v].size
+    for t in range(part[1], part[2]):
+        if wp.dot(surfaces.facing[t], eye) > 0.0:  # else it is seen from behind
+            corners = surfaces.triangles[t]
+            a = projected[v, corners[0]]
+            b = projected[v, corners[1]]
+            c = projected[v, corners[2]]
+            if a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0:
+                draw_triangle(a, b, c, t, size, keys)
+            elif a[2] > 0.0 or b[2] > 0.0 or c[2] > 0.0:
+                draw_clipped(
+                    surfaces, views[v], rotations[v, g], offsets[v, g], projected, v, t, keys
+                )

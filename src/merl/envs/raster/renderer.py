@@ -20,10 +20,10 @@ INVISIBLE = 1e-3
 
 
 class RasterRenderer:
-    """Draw a MuJoCo model with triangles on one thread.
+    """Draw a MuJoCo model with triangles, on one thread of the CPU.
 
-    What a picture needs and does not change (triangles, materials, textures) is collected once;
-    planes and sky are painted again only when they, the camera or a light have moved.
+    Triangles, materials and textures are collected once; planes and sky are painted again only
+    when they, the camera or a light have moved.
 
     Args:
         physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
@@ -116,7 +116,8 @@ class RasterRenderer:
         for name, dtype in {
             "drawn": int,
             "vertices": vec3,
-            "geom_of_vertex": int,
+            "vertex_parts": vec3i,
+            "triangle_parts": vec3i,
             "triangles": vec3i,
             "geom_of": int,
             "facing": wp.vec4,
@@ -173,85 +174,45 @@ class RasterRenderer:
         covering, shading = (
             import_module(f"merl.envs.raster.{name}") for name in ("cover", "shade")
         )
-        scene, surfaces = self._scene, self._surfaces
-        frames = [a.views, a.pose, a.offset]
+        scene, surfaces, samples = self._scene, self._surfaces, self._samples
 
-        def launch(kernel: Any, dim: Any, *inputs: Any) -> Any:
-            return wp.launch(
-                kernel, dim=dim, inputs=list(inputs), device=self._device, record_cmd=True
-            )
+        def launch(kernel: Any, dim: Any, inputs: list[Any]) -> Any:
+            return wp.launch(kernel, dim=dim, inputs=inputs, device=self._device, record_cmd=True)
 
-        views, vertices = 1 + len(self._shadows), len(scene.vertices)
         commands = {
             "place": launch(
                 covering.place_geoms,
-                (views, len(scene.drawn)),
-                *(surfaces, a.views, a.positions, a.rotations),
-                *(a.pose, a.offset, a.eyes),
+                (1 + len(self._shadows), len(scene.drawn)),
+                [surfaces, a.views, a.positions, a.rotations, a.pose, a.offset, a.eyes],
             ),
             "paint": launch(
                 shading.paint_background,
                 (self._side, self._side),
-                *(
-                    surfaces,
-                    a.views,
-                    a.lights,
-                    a.pose,
-                    a.offset,
-                ),
-                *(self._samples, a.behind, a.shadowed),
+                [surfaces, a.views, a.lights, a.pose, a.offset, samples, a.behind, a.shadowed],
             ),
-            "project": launch(covering.project, (views, vertices), surfaces, *frames, a.projected),
-            "cover": launch(
-                covering.cover,
-                len(scene.triangles),
-                *(
-                    surfaces,
-                    *frames,
-                    a.eyes,
-                    a.projected,
-                    0,
-                    a.keys,
-                ),
+            "project": launch(
+                covering.project,
+                (1 + len(self._shadows), len(scene.vertex_parts)),
+                [surfaces, a.views, a.pose, a.offset, a.projected],
             ),
             "shade": launch(
                 shading.shade,
-                a.colors.shape[:2],
-                *(
-                    surfaces,
-                    a.views,
-                    a.lights,
-                    a.maps,
-                    a.pose,
-                    a.projected,
-                ),
-                *(
-                    a.keys,
-                    a.behind,
-                    a.shadowed,
-                    self._samples,
-                    a.colors,
-                ),
+                a.colors.shape[0],
+                [surfaces, a.views, a.lights, a.maps, a.pose, a.projected]
+                + [a.keys, a.behind, a.shadowed, samples, a.colors],
             ),
             "measure": launch(
                 shading.measure,
                 a.depth.shape,
-                *(
-                    surfaces,
-                    a.keys,
-                    a.behind,
-                    self._samples,
-                    a.depth,
-                    a.geom,
-                ),
+                [surfaces, a.keys, a.behind, samples, a.depth, a.geom],
             ),
         }
-        for n in range(len(self._shadows)):
-            commands[f"shadow {n}"] = launch(
+        maps = [a.maps[n].reshape(-1) for n in range(len(self._shadows))]
+        for view, keys in enumerate([a.keys, *maps]):
+            commands[f"cover {view}"] = launch(
                 covering.cover,
-                len(scene.triangles),
-                *(surfaces, *frames, a.eyes, a.projected, 1 + n),
-                a.maps[n].reshape(-1),
+                len(scene.triangle_parts),
+                [surfaces, a.views, a.pose, a.offset, a.eyes, a.projected, view, keys],
             )
         return commands
 
@@ -278,9 +239,8 @@ class RasterRenderer:
         self._arrays.keys.zero_()
         self._arrays.maps.zero_()
         self._commands["project"].launch()
-        self._commands["cover"].launch()
-        for n in range(len(self._shadows)):
-            self._commands[f"shadow {n}"].launch()
+        for view in range(1 + len(self._shadows)):
+            self._commands[f"cover {view}"].launch()
 
     def _aim(self) -> None:
         """Where the camera and the lights are, and which way they look."""

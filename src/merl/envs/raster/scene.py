@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import mujoco
@@ -16,6 +17,9 @@ DRAWN_GROUPS = 3
 """Geoms of the groups below this are drawn, as MuJoCo does by default."""
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 """A geom's own colour counts where it differs from this, else its material's."""
+
+PART = 64
+"""Most vertices or triangles that one thread takes."""
 
 Array = NDArray[Any]
 
@@ -63,9 +67,10 @@ class Scene:
         plane_sizes: half of their edges, (P, 2), m; 0 is infinite.
         lights: the headlight, and the model's active lights.
         vertices: (V, 3), m, in their geom's frame.
-        geom_of_vertex: (V,).
         triangles: vertices of each triangle, (T, 3), counterclockwise from outside.
         geom_of: (T,).
+        vertex_parts, triangle_parts: some vertices or triangles of one geom, which one thread
+            takes: (geom, first, last + 1).
         facing: (T, 4); its product with (x, y, z, 1) is above 0 for points before the triangle.
         normals, normal_of: unit vectors (N, 3), and those of each triangle's corners, (T, 3).
         coordinates, coordinate_of: of textures, (C, 2), and of the corners, (T, 3), -1 for none.
@@ -80,7 +85,8 @@ class Scene:
     plane_sizes: Array
     lights: list[Light]
     vertices: Array
-    geom_of_vertex: Array
+    vertex_parts: Array
+    triangle_parts: Array
     triangles: Array
     geom_of: Array
     facing: Array
@@ -192,8 +198,21 @@ class _Solids:
         normal = np.cross(b - a, c - a)
         distance = (normal * a).sum(axis=1, keepdims=True)
         arrays["facing"] = np.concatenate([normal, -distance], axis=1).astype(np.float32)
-        arrays["geom_of"] = arrays["geom_of_vertex"][arrays["triangles"][:, 0]]
+        geoms = arrays.pop("geom_of_vertex")
+        arrays["geom_of"] = geoms[arrays["triangles"][:, 0]]
+        arrays["vertex_parts"] = _parts(geoms)
+        arrays["triangle_parts"] = _parts(arrays["geom_of"])
         return arrays
+
+
+def _parts(geoms: Array) -> Array:
+    """Cut what belongs to geoms into parts of one geom each: (geom, first, last + 1)."""
+    cuts = {0, len(geoms), *(np.flatnonzero(np.diff(geoms)) + 1).tolist()}
+    parts = []
+    for first, last in pairwise(sorted(cuts)):
+        for start in range(first, last, PART):
+            parts.append((geoms[first], start, min(start + PART, last)))
+    return np.array(parts, np.int32).reshape(-1, 3)
 
 
 def _color(model: Any, geom: int) -> Array:

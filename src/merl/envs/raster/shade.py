@@ -249,47 +249,48 @@ def shade(
     samples: int,
     colors: wp.array3d(dtype=wp.uint8),
 ):
-    """Colour each pixel: the mean of its samples x samples, shading each surface in it once."""
-    row, column = wp.tid()
+    """Colour a row of pixels, each the mean of its samples; a surface is shaded once in a pixel."""
+    row = wp.tid()
     side = views[0].size
-    total = wp.vec3(0.0, 0.0, 0.0)
-    color = wp.vec3(0.0, 0.0, 0.0)
-    last = int(-3)
-    for s in range(samples * samples):
-        j = row * samples + s / samples
-        k = column * samples + s % samples
-        i = j * side + k
-        key = keys[i]
-        inverse = wp.cast(wp.uint32(key >> wp.uint64(32)), float)
-        if key == wp.uint64(0) or behind[i].inverse > inverse:
-            color = behind[i].color
-            if behind[i].geom >= 0:
-                for n in range(maps.shape[0]):
-                    color += lit_share(maps, n, shadowed[n, i].where) * shadowed[n, i].color
-            last = int(-3)
-        else:
-            triangle = int(key & wp.uint64(0xFFFFFFFF)) - 1
-            surface = surfaces.geom_of[triangle]
-            if surface != last:
-                color = color_of_triangle(
-                    surfaces,
-                    views,
-                    lights,
-                    maps,
-                    projected,
-                    rotations,
-                    triangle,
-                    float(k) + 0.5,
-                    float(j) + 0.5,
-                    inverse,
-                    float(samples),
-                )
-                last = surface
+    for column in range(colors.shape[1]):
+        total = wp.vec3(0.0, 0.0, 0.0)
+        color = wp.vec3(0.0, 0.0, 0.0)
+        last = int(-3)
+        for s in range(samples * samples):
+            j = row * samples + s / samples
+            k = column * samples + s % samples
+            i = j * side + k
+            key = keys[i]
+            inverse = wp.cast(wp.uint32(key >> wp.uint64(32)), float)
+            if key == wp.uint64(0) or behind[i].inverse > inverse:
+                color = behind[i].color
+                if behind[i].geom >= 0:
+                    for n in range(maps.shape[0]):
+                        color += lit_share(maps, n, shadowed[n, i].where) * shadowed[n, i].color
+                last = int(-3)
+            else:
+                triangle = int(key & wp.uint64(0xFFFFFFFF)) - 1
+                surface = surfaces.geom_of[triangle]
+                if surface != last:
+                    color = color_of_triangle(
+                        surfaces,
+                        views,
+                        lights,
+                        maps,
+                        projected,
+                        rotations,
+                        triangle,
+                        float(k) + 0.5,
+                        float(j) + 0.5,
+                        inverse,
+                        float(samples),
+                    )
+                    last = surface
+            for n in range(3):
+                total[n] += wp.clamp(color[n], 0.0, 1.0)
+        scale = 255.0 / float(samples * samples)
         for n in range(3):
-            total[n] += wp.clamp(color[n], 0.0, 1.0)
-    scale = 255.0 / float(samples * samples)
-    for n in range(3):
-        colors[row, column, n] = wp.uint8(total[n] * scale + 0.5)
+            colors[row, column, n] = wp.uint8(total[n] * scale + 0.5)
 
 
 @wp.kernel

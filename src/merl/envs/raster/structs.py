@@ -67,13 +67,14 @@ class Level:
 
 @wp.struct
 class Surfaces:
-    """What can be hit, as `raster_scene.Scene`: triangles, planes, and what they look like."""
+    """What can be hit, as `scene.Scene`: triangles, planes, and what they look like."""
 
     drawn: wp.array(dtype=int)  # the model's geoms that are drawn; all other geoms count in these
     vertices: wp.array(dtype=wp.vec3)
-    geom_of_vertex: wp.array(dtype=int)
+    vertex_parts: wp.array(dtype=wp.vec3i)  # geom, first, last + 1
     triangles: wp.array(dtype=wp.vec3i)
     geom_of: wp.array(dtype=int)
+    triangle_parts: wp.array(dtype=wp.vec3i)
     facing: wp.array(dtype=wp.vec4)  # of a triangle's plane: above 0 for points in front of it
     normals: wp.array(dtype=wp.vec3)
     normal_of: wp.array(dtype=wp.vec3i)

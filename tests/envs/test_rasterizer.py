@@ -186,3 +186,23 @@ def test_a_geom_that_cannot_be_drawn_is_named():
     with pytest.raises(MerlError, match="cannot draw geom 'ground' of type hfield"):
         RasterRenderer(physics, "view", 32)
     physics.free()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "",
+        '<geom type="plane" size="1 1 1"/>',
+        '<geom type="box" size="1 1 1"/><light pos="0 0 3" type="point"/>',
+    ],
+    ids=["nothing", "a plane alone", "no plane"],
+)
+def test_scenes_that_lack_planes_triangles_or_lights_are_drawn(body):
+    physics = dm_mujoco.Physics.from_xml_string(
+        f"""<mujoco><visual><headlight active="0"/></visual><worldbody>
+        <camera name="view" pos="0 0 4"/>{body}</worldbody></mujoco>"""
+    )
+    renderer = RasterRenderer(physics, "view", 16)
+    assert renderer.render().shape == (16, 16, 3)
+    assert (renderer.render_segmentation() >= 0).any() == bool(body)
+    physics.free()

@@ -57,21 +57,21 @@ class RasterRenderer:
     def render(self) -> NDArray[np.uint8]:
         """See `rendering.Renderer`."""
         self._draw()
-        self._commands["shade"].launch()
+        self._launch("shade")
         image: NDArray[np.uint8] = self._arrays.colors.numpy().copy()
         return image
 
     def render_depth(self) -> NDArray[np.float32]:
         """Distance along the camera's axis, (size, size), m; infinite where nothing is hit."""
         self._draw()
-        self._commands["measure"].launch()
+        self._launch("measure")
         depth: NDArray[np.float32] = self._arrays.depth.numpy().copy()
         return depth
 
     def render_segmentation(self) -> NDArray[np.int32]:
         """The geom that each pixel shows, (size, size); -1 for the sky."""
         self._draw()
-        self._commands["measure"].launch()
+        self._launch("measure")
         geoms: NDArray[np.int32] = self._arrays.geom.numpy().copy()
         return geoms
 
@@ -198,8 +198,10 @@ class RasterRenderer:
             "shade": launch(
                 shading.shade,
                 a.colors.shape[0],
-                [surfaces, a.views, a.lights, a.maps, a.pose, a.projected]
-                + [a.keys, a.behind, a.shadowed, samples, a.colors],
+                [
+                    *(surfaces, a.views, a.lights, a.maps, a.pose, a.projected),
+                    *(a.keys, a.behind, a.shadowed, samples, a.colors),
+                ],
             ),
             "measure": launch(
                 shading.measure,
@@ -232,15 +234,20 @@ class RasterRenderer:
         moved = still != self._still
         if moved:
             self._aim()
-        self._commands["place"].launch()
+        self._launch("place")
         if moved:
-            self._commands["paint"].launch()
+            self._launch("paint")
             self._still = still
         self._arrays.keys.zero_()
         self._arrays.maps.zero_()
-        self._commands["project"].launch()
+        self._launch("project")
         for view in range(1 + len(self._shadows)):
-            self._commands[f"cover {view}"].launch()
+            self._launch(f"cover {view}")
+
+    def _launch(self, name: str) -> None:
+        command = self._commands[name]
+        if command is not None:  # as one is that has nothing to do
+            command.launch()
 
     def _aim(self) -> None:
         """Where the camera and the lights are, and which way they look."""

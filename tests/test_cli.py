@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import io
 import json
 import os
@@ -610,3 +611,29 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     shown = capsys.readouterr().out
     assert "--agent.tau" in shown
     assert "Wrong" not in shown
+
+
+@pytest.mark.parametrize(
+    "state",
+    [{}, {"progress": 3}, {"progress": {"evaluated": 1}, "replay": {"open": False}}],
+    ids=["empty", "progress is a number", "half"],
+)
+def test_a_state_that_lacks_something_is_one_line(
+    run: Path, tmp_path: Path, state: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    for checkpoint in (copy / "checkpoints").iterdir():
+        file, manifest = checkpoint / "state.json", checkpoint / "manifest.json"
+        file.write_text(json.dumps(state))
+        told = json.loads(manifest.read_text())
+        told["files"]["state.json"] = {
+            "bytes": file.stat().st_size,
+            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        }
+        manifest.write_text(json.dumps(told))
+    capsys.readouterr()
+    assert main(["resume", str(copy), "--steps", "2000"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "cannot be loaded" in error

@@ -236,6 +236,15 @@ def test_a_failed_save_leaves_the_former_one(
     assert Checkpoint.find(tmp_path).step == 100
 
 
+@pytest.mark.parametrize("content", ["[]", "3", "{", "[" * 100_000], ids=lambda text: text[:30])
+def test_a_state_of_another_form_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
+    saved = save(tmp_path / "run", 1, agent(), {}, score=None, keep=1)
+    (saved.path / "state.json").write_text(content)
+    with pytest.raises(MerlError, match="cannot be loaded") as caught:
+        saved.state()
+    assert len(str(caught.value).splitlines()) == 1
+
+
 def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
     import pickle
 

@@ -17,7 +17,7 @@ from merl.core import MerlError, NotSaved, counted, is_image
 from merl.replay import replay_bytes
 from merl.report.references import EXPERT, RANDOM, references
 from merl.training import trainer
-from merl.training.checkpoint import Checkpoint
+from merl.training.checkpoint import Checkpoint, readable
 from merl.training.config import TrainConfig
 from merl.training.console import ConsoleView
 from merl.training.environment import key_lines, own_bounds
@@ -81,18 +81,19 @@ def go_on(
         if run.begin_again():
             return _train(config, f"run {run.path} was ended before its first step", (run, None))
         start = Checkpoint.find(run.checkpoints)
-        state = start.state()
+        with readable(start):
+            state = start.state()
+            evaluated, is_open = state["progress"]["evaluated"], state["replay"]["open"]
         if config.steps < min(start.step, run.config.steps):
             raise MerlError(f"--steps {config.steps} is less than the {start.step:,} already taken")
-        evaluated = not config.eval.every or state["progress"]["evaluated"] == start.step
-        if start.step >= config.steps and evaluated:
+        if start.step >= config.steps and (not config.eval.every or evaluated == start.step):
             steps = f"{start.step:,} of {counted(config.steps, 'step')}"
             print(f"{run.path} is done: {steps}; --steps N takes it further")
             return 0
         if not run.replay.is_dir():
             raise MerlError(f"{run.replay} is gone, and without its replay a run cannot go on")
         what = f"run {run.path} goes on at step {start.step:,}"
-        if state["replay"]["open"]:
+        if is_open:
             what += " (it was stopped in an episode, and begins a new one)"
         if changes:
             what += f" with {', '.join(changes)}"

@@ -109,8 +109,15 @@ class Checkpoint:
         return max(scored, key=lambda c: (c.score, c.step)) if scored else whole[0]
 
     def state(self) -> dict[str, Any]:
-        """Where the run stood: what `save` was given."""
-        state: dict[str, Any] = json.loads((self.path / _STATE).read_text())
+        """Return the state that `save` was given.
+
+        Raises:
+            MerlError: the file cannot be read, or does not have the form that merl writes.
+        """
+        with readable(self):
+            state: dict[str, Any] = json.loads((self.path / _STATE).read_text())
+            if not isinstance(state, dict):
+                raise TypeError(f"{_STATE} holds a {type(state).__name__}, not a dict")
         return state
 
 
@@ -181,7 +188,7 @@ def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
     Raises:
         MerlError: a file cannot be read, or belongs to other networks.
     """
-    with _readable(checkpoint), torch_settings(_CPU):
+    with readable(checkpoint), torch_settings(_CPU):
         learner = _learner(checkpoint)
         agent.load_state_dict({**_weights(checkpoint), **learner})
 
@@ -192,13 +199,17 @@ def load_networks(networks: nn.Module, checkpoint: Checkpoint) -> None:
     Raises:
         MerlError: a file cannot be read, or belongs to other networks.
     """
-    with _readable(checkpoint), torch_settings(_CPU):
+    with readable(checkpoint), torch_settings(_CPU):
         networks.load_state_dict(_weights(checkpoint)["networks"])
 
 
 @contextmanager
-def _readable(checkpoint: Checkpoint) -> Iterator[None]:
-    """What goes wrong in reading, in one line."""
+def readable(checkpoint: Checkpoint) -> Iterator[None]:
+    """Say in one line why a checkpoint cannot be read.
+
+    Raises:
+        MerlError: something in here failed to read the checkpoint.
+    """
     try:
         yield
     except MerlError:
@@ -210,6 +221,7 @@ def _readable(checkpoint: Checkpoint) -> Iterator[None]:
         KeyError,
         TypeError,
         AttributeError,
+        RecursionError,
         SafetensorError,
     ) as error:
         why = " ".join(line.strip() for line in str(error).strip().split("\n")[:2])

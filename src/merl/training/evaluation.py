@@ -20,7 +20,7 @@ from merl.agents import make_agent
 from merl.core import Agent, MerlError, NotFinite, Observation, is_image
 from merl.envs.user_spaces import Modality
 from merl.statistics import Interval, bootstrap_interval, wilson_interval
-from merl.training.checkpoint import Checkpoint, load_networks
+from merl.training.checkpoint import Checkpoint, load_networks, readable
 from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.environment import make_run_env, own_bounds, run_spaces
 from merl.training.generators import kept_generators, seed_global_generators
@@ -333,6 +333,8 @@ def load_policy(
         threads=threads,
     )
     load_networks(agent.networks, saved)
+    with readable(saved):
+        reports_success = bool(saved.state()["progress"].get("reports_success", False))
     return Policy(
         agent,
         config,
@@ -340,5 +342,5 @@ def load_policy(
         device,
         step=saved.step,
         run=opened,
-        reports_success=saved.state()["progress"].get("reports_success", False),
+        reports_success=reports_success,
     )

@@ -198,21 +198,27 @@ class Stretch:
         return all(state and "bit_generator" in state for state in self._environment_states())
 
     def restore(self, start: Checkpoint) -> None:
-        """Stand where the checkpoint was taken."""
+        """Continue from a checkpoint.
+
+        Raises:
+            MerlError: the checkpoint cannot be used.
+            EnvironmentsLost: an environment's process died.
+        """
         parts, state = self.parts, start.state()
         checkpoint.load_agent(parts.agent, start)
-        parts.progress = Progress(**state["progress"])
-        parts.randomness.load_state_dict(state["randomness"])
-        self.replay.load_state_dict(state["replay"])
-        states = state["environment"]
-        self._states = states if isinstance(states, list) else [states]
         try:
-            self.environments.restore(self._states)
+            with checkpoint.readable(start):
+                parts.progress = Progress(**state["progress"])
+                parts.randomness.load_state_dict(state["randomness"])
+                self.replay.load_state_dict(state["replay"])
+                states = state["environment"]
+                self._states = states if isinstance(states, list) else [states]
+                self.environments.restore(self._states)
+                self.clock = Clock(state["seconds"], state["cpu_seconds"])
         except Lost as lost:
             raise EnvironmentsLost(
                 f"an environment's process {lost} right after its start: see what it said above"
             ) from None
-        self.clock = Clock(state["seconds"], state["cpu_seconds"])
         self.metrics.trim(parts.progress.step)
 
     def _watch_for_episode_end(self, moment: Moment) -> None:

@@ -183,7 +183,7 @@ def test_a_bad_action_moves_nothing(blind, action, message):
         (
             "reach_duplo",
             {"renderer": "vulkan"},
-            "'vulkan' is unknown: choose from auto, gl, warp",
+            "'vulkan' is unknown: choose from auto, gl, raster, warp",
         ),
         ("reach_duplo", {"proprio": "some"}, "proprio 'some' is unknown"),
         ("reach_duplo", {"image_size": 15}, "image_size is 15: .* at least 16"),

@@ -207,7 +207,7 @@ def test_a_policy_takes_tensors_and_names_what_it_cannot_take(tmp_path: Path) ->
     np.testing.assert_array_equal(policy(tensors), action)  # type: ignore[arg-type]
     for key, value, says in (
         ("joints", [[1.0], [1.0, 2.0]], "cannot be converted"),
-        ("joints", None, "'joints' holds what is no number: None"),
+        ("joints", None, "'joints' holds something that is not a number: None"),
         ("joints", np.zeros(3), r"'joints' has shape \(3,\)"),
         ("joints", np.full(4, 1e300), "beyond float32"),
         ("pixels", observation["pixels"] / 255, "'pixels' is of float64"),

@@ -26,7 +26,7 @@ ENOUGH = 5
 def summarize(outcome: Outcome, console: Console) -> None:
     """Print the table, draw the curve, say plainly what was learnt, and how to go on.
 
-    The run is saved: what fails here is told in one line, and the rest goes on.
+    The run is saved. What fails here costs one line, and the rest is still printed.
     """
     run, trained = outcome.run, outcome.evaluation
     from merl.report.figures import learning_curve  # here, for Matplotlib is slow to import

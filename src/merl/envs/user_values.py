@@ -47,7 +47,7 @@ def to_array(name: str, value: Any) -> NDArray[Any]:
             f"{name} cannot be converted to an array of numbers ({reason}): it is {shown(value)}"
         ) from None
     if array.dtype.kind not in "biuf":
-        raise EnvironmentFailed(f"{name} holds what is no number: {shown(value)}")
+        raise EnvironmentFailed(f"{name} holds something that is not a number: {shown(value)}")
     return array
 
 

@@ -49,7 +49,7 @@ class EvaluationConfig:
                 raise MerlError(f"eval.{flag} must be at least {least}, not {getattr(self, name)}")
 
     def count(self, steps: int) -> int:
-        """Return how many evaluations a run of so many steps has."""
+        """Return the number of evaluations of a run of `steps` steps."""
         return max(1, steps // self.every) if self.every else 0
 
 

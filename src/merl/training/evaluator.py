@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from merl.training.stretch import View
 
 ATTEMPTS = 3
-"""At an evaluation that is killed or crashes the process, before the run goes on without it."""
+"""Attempts at an evaluation that is killed or crashes the process; then it is left out."""
 
 
 class _Interrupted(Exception):  # noqa: N818 (no error, a way out)

@@ -1,4 +1,4 @@
-"""Guards: what is no number is neither remembered, nor learnt from, nor saved."""
+"""Guards: reject NaN and infinity before they reach replay, update or checkpoint."""
 
 from __future__ import annotations
 

@@ -167,15 +167,15 @@ def test_nothing_but_training_and_evaluation_moves_a_users_robot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    assert moves(tmp_path, "--eval.video", "none") == (10 + 2 + 2, 100 + 20)  # two are compared
+    assert moves(tmp_path, "--eval.video", "none") == (10 + 2 + 3, 100 + 20)  # two are compared
     said = " ".join(capsys.readouterr().out.split())
     assert "100 steps of test_own_env:Logged on cpu (how long they take is said after" in said
     assert "49 steps of test_own_env:Logged on cpu take about 0:00:0" in said
     assert "nothing to compare with (--eval.references takes 20 episodes" in said
-    assert moves(tmp_path) == (10 + 2 + 2 + 1, 100 + 20)  # whether it can be filmed
-    assert moves(tmp_path, "--eval.video", "none", "--eval.references") == (14 + 40, 120 + 400)
+    assert moves(tmp_path) == (10 + 2 + 3 + 1, 100 + 20)  # whether it can be filmed
+    assert moves(tmp_path, "--eval.video", "none", "--eval.references") == (15 + 40, 120 + 400)
     resets, steps = moves(tmp_path, "--eval.video", "none", "--measure")
-    assert (resets > 14, steps) == (True, 120 + 75)
+    assert (resets > 15, steps) == (True, 120 + 75)
 
 
 @pytest.mark.parametrize("agent", ["ddpg", "sac", "merl_state"])

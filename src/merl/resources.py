@@ -7,7 +7,10 @@ import errno
 import multiprocessing
 import os
 import re
+import sys
 from collections.abc import Iterator
+from contextlib import chdir
+from importlib import import_module
 from pathlib import Path
 
 MOST_PICTURE_THREADS = 4
@@ -184,3 +187,14 @@ def _left_in(limit: Path, usage: Path, stat: Path, prefix: str) -> int | None:
         return None
     counts = re.findall(rf"^{prefix}(?:in)?active_file (\d+)$", statistics, re.MULTILINE)
     return max(0, int(most) - max(0, used - sum(map(int, counts))))
+
+
+def load_matplotlib() -> None:
+    """Import Matplotlib without the `matplotlibrc` of the working folder, which it reads first.
+
+    That folder may be the run of a stranger, and such a file may name programs to start.
+    """
+    if "matplotlib" in sys.modules or not Path("matplotlibrc").exists():
+        return
+    with chdir(Path(__file__).parent):
+        import_module("matplotlib")

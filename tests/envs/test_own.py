@@ -225,7 +225,7 @@ class Misgiving(Given):
         (lambda o: (None, 0.0, False, False, {}), "observation is of NoneType"),
         (lambda o: ({"arm": o["arm"]}, 0.0, False, False, {}), "lacks 'eye'"),
         (lambda o: (o | {"arm": np.zeros(3)}, 0.0, False, False, {}), r"\(3,\), but its space"),
-        (lambda o: (o | {"arm": ["a", "b"]}, 0.0, False, False, {}), "'arm' holds what is no"),
+        (lambda o: (o | {"arm": ["a", "b"]}, 0.0, False, False, {}), "'arm' holds something"),
         (lambda o: (o | {"eye": np.zeros((31, 32, 3), np.uint8)}, 0.0, False, False, {}),
          r"'eye' has shape \(31, 32, 3\)"),
         (lambda o: 1 / 0, r"step raised ZeroDivisionError: division by zero \(test_own.py, line"),
@@ -352,3 +352,35 @@ def test_a_place_that_cannot_be_opened_is_not_named(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="servo") as caught:
         names["step"]()
     assert "gone.py" not in in_one_line(caught.value)
+
+
+class Unspeakable(BaseException):
+    """Neither an Exception, nor one that can be told."""
+
+    def __str__(self) -> str:
+        raise RuntimeError
+
+
+def _unspeakable() -> None:
+    raise Unspeakable
+
+
+class LostCamera(dict[str, Any]):
+    def __getitem__(self, key: str) -> Any:
+        raise RuntimeError("camera lost")
+
+
+@pytest.mark.parametrize(
+    ("step", "says"),
+    [
+        (lambda o: _unspeakable(), r"step raised Unspeakable \(test_own.py, line"),
+        (lambda o: (LostCamera(o), 0.0, False, False, {}), "raised RuntimeError: camera lost"),
+        (lambda o: (o, 0.0, False, False, LostCamera(success=True)), "RuntimeError: camera lost"),
+    ],
+)
+def test_whatever_user_code_raises_is_one_line(step: Any, says: str) -> None:
+    env = adapt(Misgiving(step=step))
+    env.reset()
+    with pytest.raises(EnvironmentFailed, match=says) as caught:
+        env.step(np.zeros(2, np.float32))
+    assert len(str(caught.value).splitlines()) == 1

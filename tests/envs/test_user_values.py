@@ -79,6 +79,16 @@ def test_a_reward_is_one_number(value: Any, says: str) -> None:
     assert len(str(caught.value).splitlines()) == 1
 
 
+def test_masked_values_are_refused() -> None:
+    with pytest.raises(EnvironmentFailed, match="'arm' has masked values: fill them"):
+        to_array("observation 'arm'", np.ma.masked_array([0.0, 999.0], mask=[0, 1]))
+    assert to_array("x", np.ma.masked_array([0.0, 1.0], mask=[0, 0])).tolist() == [0.0, 1.0]
+
+
+def test_numbers_in_an_object_array_are_numbers() -> None:
+    assert to_array("x", np.array([0.5, 1], object)).tolist() == [0.5, 1.0]
+
+
 def test_a_reward_may_be_an_array_of_one_or_a_tensor() -> None:
     for value in (2, np.float32(2), [2.0], np.full((1, 1), 2), torch.tensor(2.0).requires_grad_()):
         assert to_number("reward", value) == 2.0

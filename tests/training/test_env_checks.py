@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import warnings
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -79,6 +80,47 @@ def test_running_statistics_are_refused_anywhere(make: Any) -> None:
     assert "Normalize" in str(refused.value) or "MyNormalizer" in str(refused.value)
 
 
+class Keeping(Plain):
+    """Statistics that are no attribute, but lie in a dict, or in an object that is one."""
+
+    def __init__(self, statistics: Any) -> None:
+        super().__init__()
+        self.kept = statistics
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        {"obs": RunningMeanStd()},
+        [RunningMeanStd()],
+        SimpleNamespace(obs=RunningMeanStd()),
+        SimpleNamespace(parts=[RunningMeanStd()]),
+    ],
+    ids=["dict", "list", "object", "object with a list"],
+)
+def test_running_statistics_in_containers_are_refused(kept: Any) -> None:
+    with pytest.raises(MerlError, match="wrapped in Keeping"):
+        refuse_running_statistics(adapt(Keeping(kept)))
+
+
+class SubtractsTheMean(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """The commonest running mean: after one observation it is that observation."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.count, self.mean = 0, 0.0
+
+    def observation(self, observation: Any) -> Any:
+        self.count += 1
+        self.mean += (observation - self.mean) / self.count
+        return (observation - self.mean).astype(np.float32)
+
+
+def test_a_running_mean_is_warned_of_at_the_start() -> None:
+    with pytest.warns(UserWarning, match="after resets with the same seed differs"):
+        check_instances(adapt(Plain()), adapt(SubtractsTheMean(Plain())))
+
+
 HARMLESS = [
     Plain,
     lambda: wrappers.TimeLimit(Plain(), 10),
@@ -121,7 +163,7 @@ class Unseeded(Plain):
 @pytest.mark.parametrize("make", [lambda: Filter(Plain()), Unseeded])
 def test_first_observations_that_depend_on_the_past_are_warned_of(make: Any) -> None:
     env = adapt(make())
-    with pytest.warns(UserWarning, match="after two resets with the same seed differs in 'state'"):
+    with pytest.warns(UserWarning, match="after resets with the same seed differs in 'state'"):
         check_instances(env, adapt(make()))
 
 

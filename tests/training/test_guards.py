@@ -88,7 +88,8 @@ def test_what_the_environment_gives_stops_the_run(
     assert says in told.err
     assert "Traceback" not in told.err
     start = Checkpoint.find(Run.open(run).checkpoints)
-    assert start.step == BAD_STEP - 10
+    assert start.step == BAD_STEP - 1
+    assert f"the run is saved at step {BAD_STEP - 1}: mend it" in told.err
     for name in ("reward", "observation.state"):
         assert np.isfinite(np.fromfile(run / "replay" / f"{name}.bin", "<f4")).all()
 

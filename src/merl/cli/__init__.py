@@ -22,6 +22,7 @@ from typing import Any
 
 import merl
 from merl.core import MerlError, meant
+from merl.python_path import working_folder_hidden
 from merl.training.output import tolerant_output
 
 # The modules are imported when called: a misspelt command should not wait for torch.
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     args = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with tolerant_output() as (out, _):
+        with tolerant_output() as (out, _), working_folder_hidden():
             code = _run(args)
     except SystemExit:  # after printing help
         if out.error is None:

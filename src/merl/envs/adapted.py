@@ -102,7 +102,8 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         with failing("reset"):
             given = self.env.reset(seed=seed, options=options)
         observation, info = _apart("reset", given, ("observation", "info"))
-        return self._adapted(observation), to_info(info)
+        with failing("observation or info"):
+            return self._adapted(observation), to_info(info)
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], Any, bool, bool, Any]:
         """Take an action in [-1, 1]; see `gymnasium.Env.step`.
@@ -117,8 +118,9 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
             given = self.env.step(wanted)
         names = ("observation", "reward", "terminated", "truncated", "info")
         observation, reward, terminated, truncated, info = _apart("step", given, names)
-        over = to_bool("terminated", terminated), to_bool("truncated", truncated)
-        return self._adapted(observation), to_number("reward", reward), *over, to_info(info)
+        with failing("observation, reward or info"):
+            over = to_bool("terminated", terminated), to_bool("truncated", truncated)
+            return self._adapted(observation), to_number("reward", reward), *over, to_info(info)
 
     def render(self) -> Any:
         """See `gymnasium.Env.render`.
@@ -183,7 +185,7 @@ def failing(what: str) -> Iterator[None]:
         yield
     except MerlError:
         raise
-    except (Exception, SystemExit, KeyboardInterrupt) as error:  # drivers do call sys.exit
+    except BaseException as error:  # drivers call sys.exit, bindings raise kinds of their own
         if isinstance(error, KeyboardInterrupt) and _ctrl_c_raises():
             raise
         raise EnvironmentFailed(f"the environment's {what} raised {in_one_line(error)}") from error
@@ -196,7 +198,10 @@ def _ctrl_c_raises() -> bool:
 
 def in_one_line(error: BaseException) -> str:
     """An exception's kind and text, and the last place in the user's own files that led to it."""
-    text = " ".join(str(error).split())
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # the exception's own __str__ may fail
+        text = ""
     kind = type(error).__name__
     described = f"{kind}: {text}" if text else kind
     for frame in reversed(traceback.extract_tb(error.__traceback__)):

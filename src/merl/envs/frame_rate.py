@@ -15,7 +15,10 @@ SLOWEST, FASTEST = 0.1, 1000.0
 
 def frame_rate(metadata: Any) -> float | None:
     """Return `render_fps` in frames a second; None if it is not a usable positive number."""
-    rate = metadata.get("render_fps") if isinstance(metadata, Mapping) else None
+    try:
+        rate = metadata.get("render_fps") if isinstance(metadata, Mapping) else None
+    except Exception:  # a mapping of the user's own
+        return None
     if isinstance(rate, np.ndarray) and rate.size == 1:
         rate = rate.item()
     if not isinstance(rate, Real) or isinstance(rate, bool):

@@ -21,6 +21,7 @@ from merl.envs.adapted import adapt, failing, in_one_line
 from merl.envs.config import UserEnvConfig
 from merl.envs.packages import installing
 from merl.envs.registration import ENV_IDS
+from merl.python_path import set_value, users_value
 
 BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that come with merl."""
@@ -95,6 +96,7 @@ def load_module(task: str, *folders: Path) -> ModuleType:
         raise MerlError(f"task {task!r}: write it as my_robot:make_env, for my_robot.py here")
     try:
         if task not in BUNDLED:
+            set_value(users_value())  # it may start Python processes that need the folder
             any(_load_from(folder, module.partition(".")[0]) for folder in folders)
         return importlib.import_module(module)
     except MerlError:
@@ -206,10 +208,11 @@ def _renders(env: gymnasium.Env[Any, Any]) -> bool:
     if env.render_mode is None:
         return False
     try:
-        env.reset(seed=0)
-        picture: Any = env.render()
-    except Exception as error:  # whatever a display or a driver may raise
-        warnings.warn(f"the environment cannot be filmed: {in_one_line(error)}", stacklevel=1)
+        with failing("render"):
+            env.reset(seed=0)
+            picture: Any = env.render()
+    except MerlError as error:
+        warnings.warn(f"the environment cannot be filmed: {error}", stacklevel=1)
         return False
     usable = isinstance(picture, np.ndarray) and picture.dtype == np.uint8
     if not usable or picture.ndim != 3 or picture.shape[2] != 3:

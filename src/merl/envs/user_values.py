@@ -6,6 +6,7 @@ Every function that refuses a value raises `EnvironmentFailed` with one line tha
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,12 @@ def to_array(name: str, value: Any) -> NDArray[Any]:
         raise EnvironmentFailed(
             f"{name} cannot be converted to an array of numbers ({reason}): it is {shown(value)}"
         ) from None
+    if np.ma.is_masked(value):
+        raise EnvironmentFailed(
+            f"{name} has masked values: fill them, for example with value.filled(0.0)"
+        )
+    if array.dtype.kind == "O" and all(isinstance(part, Real) for part in array.flat):
+        array = array.astype(np.float64)
     if array.dtype.kind not in "biuf":
         raise EnvironmentFailed(f"{name} holds something that is not a number: {shown(value)}")
     return array

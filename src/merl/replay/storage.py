@@ -237,7 +237,15 @@ def _read_layout(header: Path, fields: dict[str, Field]) -> Layout | None:
             (directory / f"{name}.bin").stat().st_size >= held * field.bytes
             for name, field in fields.items()
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (
+        OSError,
+        ArithmeticError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise MerlError(f"{directory} holds a damaged replay: give another folder") from error
     if not same:
         raise MerlError(

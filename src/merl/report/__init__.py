@@ -2,3 +2,7 @@
 
 Everything here works from a run's folder alone and needs neither torch nor MuJoCo.
 """
+
+from merl.resources import load_matplotlib
+
+load_matplotlib()

@@ -7,7 +7,6 @@ environments in processes of their own step while the learner learns.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import pickle
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +24,8 @@ from gymnasium.vector.async_vector_env import AsyncState
 from numpy.typing import NDArray
 
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
-from merl.envs.own import load_module, module_folder
+from merl.envs.own import imports_code, load_module, module_folder
+from merl.python_path import set_value, users_value, working_folder_hidden
 from merl.training.config import TrainConfig
 from merl.training.environment import (
     EnvSpaces,
@@ -43,9 +43,6 @@ _TOLD = "told"
 _LEFT_TO_THE_RUN = (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
 """A terminal or a batch system sends them to the workers too, which are to work on until the run
 has saved and ends them. SIGTERM is what they are ended by."""
-_SAFE_PATH = "PYTHONSAFEPATH"
-"""With it Python leaves the working folder out of `sys.path`."""
-
 START_SECONDS = 300.0
 """In which all processes must have made their environments."""
 END_SECONDS = 5.0
@@ -279,7 +276,7 @@ class Workers:
             _killing_after(
                 START_SECONDS, lambda: set(multiprocessing.active_children()) - {*others}
             ),
-            _without_the_working_folder(),
+            working_folder_hidden(),
         ):
             # What a worker raises is raised here; Gymnasium would print it, too.
             gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
@@ -298,27 +295,6 @@ def _killing_after(
         yield
     finally:
         impatience.cancel()
-
-
-@contextmanager
-def _without_the_working_folder() -> Iterator[None]:
-    """Start Python processes that do not look for modules in the working folder.
-
-    They are started by `python -c`, which searches it before the standard library.
-    """
-    before = os.environ.get(_SAFE_PATH)
-    os.environ[_SAFE_PATH] = "1"
-    try:
-        yield
-    finally:
-        _set_environment(_SAFE_PATH, before)
-
-
-def _set_environment(name: str, value: str | None) -> None:
-    if value is None:
-        os.environ.pop(name, None)
-    else:
-        os.environ[name] = value
 
 
 def _kill(processes: Iterable[BaseProcess]) -> None:
@@ -415,7 +391,7 @@ class _Maker:
     here: gymnasium.Env[Any, Any] | None
     folder: Path | None
     """From which the module of a user's environment was loaded."""
-    safe_path: str | None = field(default_factory=lambda: os.environ.get(_SAFE_PATH))
+    safe_path: str | None = field(default_factory=users_value)
     """What the user set; the environment may start Python processes of its own."""
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
@@ -423,7 +399,8 @@ class _Maker:
             return _StandIn(self.expected)
         for number in _LEFT_TO_THE_RUN:
             signal.signal(number, signal.SIG_IGN)
-        _set_environment(_SAFE_PATH, self.safe_path)
+        if imports_code(self.config.task):
+            set_value(self.safe_path)
         tolerate_lost_output()
         with _errors_that_arrive():
             if self.folder is not None:

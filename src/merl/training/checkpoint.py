@@ -38,6 +38,8 @@ _WEIGHTS, _LEARNER, _STATE, _MANIFEST = (
     "state.json",
     "manifest.json",
 )
+_FILES = (_WEIGHTS, _LEARNER, _STATE)
+_BAD_VALUES = (ValueError, TypeError, AttributeError, RecursionError)
 _WEIGHT_GROUPS = ("networks", "critic_target")
 _CPU = torch.device("cpu")
 _LOG = logging.getLogger(__name__)
@@ -68,7 +70,13 @@ class Checkpoint:
             manifest = json.loads((path / _MANIFEST).read_text())
             files, number = manifest["files"], manifest["format"]
             step, score = int(manifest["step"]), manifest["score"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            score = None if score is None else float(score)
+            if step < 0 or any(Path(name).name != name for name in files):
+                raise ValueError(f"step {step}, files {', '.join(files)}")
+            missing = {*_FILES} - {*files.keys()}
+            if missing:
+                raise ValueError(f"it does not list {', '.join(sorted(missing))}")
+        except (OSError, LookupError, ArithmeticError, *_BAD_VALUES) as error:
             raise MerlError(f"checkpoint {path} has no readable manifest ({error})") from None
         if number != FORMAT:
             raise MerlError(f"checkpoint {path} has format {number}, this merl reads {FORMAT}")
@@ -79,7 +87,7 @@ class Checkpoint:
                 whole = False
             if not whole:
                 raise MerlError(f"checkpoint {path}: {name} is missing or damaged")
-        return cls(path, step, None if score is None else float(score))
+        return cls(path, step, score)
 
     @classmethod
     def find(cls, root: Path, which: str = "latest") -> Checkpoint:
@@ -280,8 +288,12 @@ def _folders(root: Path) -> list[Path]:
     """Checkpoints by step, oldest first."""
     if not root.is_dir():
         return []
-    folders = [path for path in root.iterdir() if path.is_dir() and path.name.isdigit()]
+    folders = [path for path in root.iterdir() if path.is_dir() and _is_number(path.name)]
     return sorted(folders, key=lambda path: int(path.name))
+
+
+def _is_number(name: str) -> bool:
+    return name.isascii() and name.isdecimal()
 
 
 def _prune(root: Path, step: int, keep: int) -> None:

@@ -13,7 +13,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import vector
 
 from merl.core import MerlError
-from merl.training.generators import kept_generators, seed_global_generators
+from merl.training.generators import held_by, kept_generators, seed_global_generators
 
 NORMALIZERS = (
     wrappers.NormalizeObservation,
@@ -33,21 +33,22 @@ def refuse_running_statistics(env: gymnasium.Env[Any, Any]) -> None:
     Raises:
         MerlError: naming the wrapper.
     """
-    for layer in _inner_environments(env):
-        if _has_running_statistics(layer):
-            raise MerlError(
-                f"the environment is wrapped in {type(layer).__name__}, whose running statistics "
-                "would differ between training, evaluation and the saved policy: take it off; "
-                "--agent.standardize scales the observed vectors with statistics that belong to "
-                "the agent"
-            )
+    layers = [layer for layer in _inner_environments(env) if _has_running_statistics(layer)]
+    if layers:  # the innermost one has them, the others hold it
+        raise MerlError(
+            f"the environment is wrapped in {type(layers[-1]).__name__}, whose running statistics "
+            "would differ between training, evaluation and the saved policy: take it off; "
+            "--agent.standardize scales the observed vectors with statistics that belong to "
+            "the agent"
+        )
 
 
 def check_instances(env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, Any]) -> None:
     """Warn if training and evaluation share one object, or if starts depend on the past.
 
-    The evaluation's environment is reset twice with the same seed, and takes no step. An
-    observation that is filtered, normalised or collected across resets differs the second time, and
+    The evaluation's environment is reset with one seed, with another, and with the first again, and
+    takes no step. An observation that is filtered, normalised or collected across resets differs
+    the second time, and
     so does one that does not follow from the seed (a real robot, an environment that ignores it).
     Statistics that only change in `step` are not seen here.
 
@@ -61,11 +62,11 @@ def check_instances(env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, A
             stacklevel=1,
         )
     with kept_generators(eval_env):
-        first, second = _first_observation(eval_env), _first_observation(eval_env)
+        first, _, second = (_first_observation(eval_env, seed) for seed in (0, 1, 0))
     differing = [key for key in first if not _equal(first[key], second[key])]
     if differing:
         warnings.warn(
-            f"the first observation after two resets with the same seed differs in "
+            f"the first observation after resets with the same seed differs in "
             f"{', '.join(map(repr, differing))}: evaluations will not start alike, and a wrapper "
             "that keeps state across resets makes the trained policy see other numbers later",
             stacklevel=1,
@@ -81,9 +82,7 @@ def _inner_environments(env: Any) -> Iterator[Any]:
             continue
         seen.add(id(layer))
         yield layer
-        for value in getattr(layer, "__dict__", {}).values():
-            parts = value if isinstance(value, list | tuple) else [value]
-            found += [part for part in parts if _is_environment(part)]
+        found += [part for part in held_by(layer) if _is_environment(part)]
 
 
 def _is_environment(value: Any) -> bool:
@@ -96,17 +95,16 @@ def _is_environment(value: Any) -> bool:
 def _has_running_statistics(layer: Any) -> bool:
     if not getattr(layer, "update_running_mean", True):
         return False
-    attributes = getattr(layer, "__dict__", {}).values()
     # Other libraries and users build such wrappers around a class of this name, too.
+    kinds = (kind for value in held_by(layer) for kind in type(value).__mro__)
     return isinstance(layer, NORMALIZERS) or any(
-        kind.__name__ == "RunningMeanStd" for value in attributes for kind in type(value).__mro__
+        kind.__name__ == "RunningMeanStd" for kind in kinds
     )
 
 
-def _first_observation(env: gymnasium.Env[Any, Any]) -> Mapping[str, Any]:
-    # As an evaluation does it; any seed would do.
-    seed_global_generators(0)
-    observation: Mapping[str, Any] = env.reset(seed=0)[0]
+def _first_observation(env: gymnasium.Env[Any, Any], seed: int) -> Mapping[str, Any]:
+    seed_global_generators(seed)  # as an evaluation does
+    observation: Mapping[str, Any] = env.reset(seed=seed)[0]
     return {key: np.array(value) for key, value in observation.items()}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -315,8 +316,12 @@ def load_policy(
     Raises:
         MerlError: there is no run, or no whole checkpoint in it.
     """
-    if threads is not None and (type(threads) is not int or threads < 1):
-        raise MerlError(f"threads is {threads!r}: give a whole number, at least 1, or None")
+    most = os.cpu_count() or 1
+    if threads is not None and (type(threads) is not int or not 1 <= threads <= most):
+        raise MerlError(
+            f"threads is {threads!r}: give None, or a whole number from 1 to {most}, which this "
+            "machine has"
+        )
     opened = Run.open(Path(run))
     saved = Checkpoint.find(opened.checkpoints, str(checkpoint))
     config, device = opened.config, torch.device("cpu")

@@ -10,8 +10,9 @@ from __future__ import annotations
 import base64
 import random
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -73,9 +74,29 @@ def kept_generators(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
             torch.cuda.set_rng_state(cuda)
 
 
+def held_by(owner: Any) -> Iterator[Any]:
+    """Yield what an object holds: attributes, items of lists and dicts, and their attributes."""
+    for value in _parts(getattr(owner, "__dict__", {}).values()):
+        yield value
+        if not isinstance(value, type | ModuleType | gymnasium.Env):
+            yield from _parts(getattr(value, "__dict__", {}).values())
+
+
+def _parts(values: Iterable[Any]) -> Iterator[Any]:
+    """The values, and the items of those that are lists, tuples or dicts."""
+    for value in list(values):
+        yield value
+        if isinstance(value, list | tuple):
+            yield from value
+        elif isinstance(value, dict):
+            yield from list(value.values())
+
+
 def _restorers(env: gymnasium.Env[Any, Any]) -> Iterator[Callable[[], object]]:
     """For each generator that the environment holds, a function that restores it."""
     for owner in _owners(env):
+        if isinstance(owner, gymnasium.Env):
+            yield from filter(None, map(_restorer, held_by(owner)))
         for name, value in list(getattr(owner, "__dict__", {}).items()):
             restore = _restorer(value)
             if restore is not None:

@@ -243,7 +243,7 @@ class Run:
         Returns:
             Whether it is so; what has saved, measured or remembered anything is left as it is.
         """
-        if any(path.name.isdigit() for path in self.checkpoints.glob("*")):
+        if any(path.name.isdecimal() for path in self.checkpoints.glob("*")):
             return False
         metrics = self.path / METRICS_FILE
         has_rows = metrics.exists() and metrics.read_bytes().count(b"\n") > 1
@@ -345,7 +345,16 @@ def _readable(path: Path) -> Iterator[None]:
         raise MerlError(f"{file} cannot be read: it has no {error}") from None
     except OSError as error:
         raise MerlError(f"{file} cannot be read: {error.strerror}") from None
-    except (MerlError, ValueError, TypeError, AttributeError, IndexError) as error:
+    except (
+        MerlError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+        ArithmeticError,
+        MemoryError,
+        RecursionError,
+    ) as error:
         raise MerlError(f"{file} cannot be read: {error}") from None
 
 

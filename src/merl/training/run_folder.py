@@ -116,11 +116,18 @@ def check_links(run: Path) -> None:
     for folder, folders, files in os.walk(run):
         for name in (*folders, *files):
             path = Path(folder, name)
-            if path.is_symlink() and root not in path.resolve().parents:
+            if path.is_symlink() and not _lies_in(path, root):
                 raise MerlError(
                     f"{path} is a link to {path.readlink()}, outside of the run, and is not "
                     "written to: replace it by what it leads to"
                 )
+
+
+def _lies_in(link: Path, root: Path) -> bool:
+    try:
+        return root in link.resolve().parents
+    except (OSError, RuntimeError):  # a loop of links
+        return False
 
 
 def discard_folder(run: Path, created: bool) -> None:

@@ -21,6 +21,8 @@ _APART = 0.1
 same one twice, to the process and to its group."""
 _getsignal, _signal = unwrap(signal.getsignal), unwrap(signal.signal)
 """Without the conversion to enums, which takes ten times as long."""
+_wakeup: list[int] = []
+"""The pipe that Python writes signals to, as long as an `Interrupt` listens."""
 PATIENCE = 3.0
 """Seconds after which who has asked to stop is told what is waited for."""
 
@@ -67,9 +69,11 @@ class Interrupt:
         former = {number: signal.signal(number, self._handle) for number in heard}
         self._arrived, into = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         former_wakeup = signal.set_wakeup_fd(into, warn_on_full_buffer=False)
+        _wakeup.append(into)
         try:
             yield self
         finally:
+            _wakeup.pop()
             signal.set_wakeup_fd(former_wakeup)
             for number, handler in former.items():
                 signal.signal(number, handler)
@@ -128,6 +132,8 @@ class handlers_kept:  # noqa: N801 (a context manager, used like a function)
             for number, handler in self._former:
                 if handler is not None:  # it is another library's, from before Python's start
                     _signal(number, handler)
+            if _wakeup:
+                signal.set_wakeup_fd(_wakeup[-1], warn_on_full_buffer=False)
 
 
 def _tell() -> None:

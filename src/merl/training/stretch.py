@@ -9,7 +9,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, counted, is_image
+from merl.core import (
+    EnvironmentFailed,
+    EnvironmentsLost,
+    EvaluationFailed,
+    MerlError,
+    NotFinite,
+    counted,
+    is_image,
+)
 from merl.replay import Lanes
 from merl.training import checkpoint
 from merl.training.acting import Environments, Lost
@@ -108,21 +116,31 @@ class Stretch:
         Raises:
             EnvironmentFailed: the user's environment failed; the run can be resumed.
             EvaluationFailed: an evaluation failed; the run can be resumed.
+            NotFinite: an observation or a reward is NaN or infinite, and the run can be resumed; or
+                a loss or a weight is, and nothing newer than the last checkpoint is usable.
         """
         try:
             return self._drive()
-        except (Exception, KeyboardInterrupt) as error:
+        except BaseException as error:
             if isinstance(error, KeyboardInterrupt):  # by a handler of the environment's
                 self.interrupt.note(signal.SIGINT)
             if self.interrupt.number is not None:
                 return self._outcome(self._save())
-            step = self.parts.progress.step
-            if not isinstance(error, EnvironmentFailed) or step == 0 or not self._save():
+            step, line = self.parts.progress.step, resume_line(self.run.path)
+            if isinstance(error, EvaluationFailed | EnvironmentsLost) or not self._rescue():
                 raise
-            raise EnvironmentFailed(
-                f"{error}; the run is saved at step {step:,}: mend it, and go on with "
-                f"`{resume_line(self.run.path)}`"
-            ) from error
+            saved = f"the run is saved at step {step:,}: mend it, and go on with `{line}`"
+            if isinstance(error, EnvironmentFailed | NotFinite):
+                raise type(error)(f"{error}; {saved}") from error
+            self.view.warn(saved)
+            raise
+
+    def _rescue(self) -> bool:
+        """Save after an error, if there is anything to save; returns whether it succeeded."""
+        try:
+            return self.parts.progress.step > 0 and self._save()
+        except Exception:  # the weights are not finite, or the folder is gone
+            return False
 
     def _drive(self) -> Outcome:
         """Between the loop's steps log, evaluate, save, and see whether to stop."""
@@ -208,13 +226,16 @@ class Stretch:
         checkpoint.load_agent(parts.agent, start)
         try:
             with checkpoint.readable(start):
-                parts.progress = Progress(**state["progress"])
+                counts = state["progress"]
+                if not all(isinstance(count, int) and count >= 0 for count in counts.values()):
+                    raise TypeError(f"progress is {counts}")
+                parts.progress = Progress(**counts)
                 parts.randomness.load_state_dict(state["randomness"])
                 self.replay.load_state_dict(state["replay"])
                 states = state["environment"]
                 self._states = states if isinstance(states, list) else [states]
                 self.environments.restore(self._states)
-                self.clock = Clock(state["seconds"], state["cpu_seconds"])
+                self.clock = Clock(float(state["seconds"]), float(state["cpu_seconds"]))
         except Lost as lost:
             raise EnvironmentsLost(
                 f"an environment's process {lost} right after its start: see what it said above"

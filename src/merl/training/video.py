@@ -13,7 +13,6 @@ from types import TracebackType
 from typing import Self
 
 import av
-import matplotlib
 import numpy as np
 from av.container import OutputContainer
 from av.video.stream import VideoStream
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from merl.core import MerlError
+from merl.resources import load_matplotlib
 
 MIN_SIDE = 480  # pixels; below it neither the fingers nor the captions can be made out
 FPS = 25.0  # frames a second: one picture for each control step of 0.04 s
@@ -243,4 +243,7 @@ def _font(text: str, size: int, room: float) -> ImageFont.FreeTypeFont:
 @lru_cache(maxsize=64)
 def _face(size: int) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which comes with matplotlib, of `size` pixels."""
-    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)
+    load_matplotlib()
+    from matplotlib import get_data_path
+
+    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)

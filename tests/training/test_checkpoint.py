@@ -245,6 +245,36 @@ def test_a_state_of_another_form_is_refused_in_one_line(tmp_path: Path, content:
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"files": []},
+        {"files": {}},
+        {"files": {"../../weights.safetensors": {}}},
+        {"step": float("inf")},
+        {"step": -5},
+        {"score": "x"},
+        {"score": [1]},
+    ],
+    ids=str,
+)
+def test_a_manifest_of_another_form_is_refused_in_one_line(
+    tmp_path: Path, change: dict[str, object]
+) -> None:
+    saved = save(tmp_path / "run", 1, agent(), {}, score=None, keep=1)
+    manifest = saved.path / "manifest.json"
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), **change}))
+    with pytest.raises(MerlError, match="no readable manifest") as caught:
+        Checkpoint.open(saved.path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_folder_that_only_looks_like_a_number_is_no_checkpoint(tmp_path: Path) -> None:
+    save(tmp_path, 1, agent(), {}, score=None, keep=1)
+    (tmp_path / "\N{SUPERSCRIPT TWO}").mkdir()
+    assert Checkpoint.find(tmp_path).step == 1
+
+
 def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
     import pickle
 

@@ -232,9 +232,21 @@ def _by_id(env_id: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
     try:
         return gymnasium.make(env_id)
     except ImportError as error:
-        raise MerlError(
-            f"task {env_id!r} cannot be made: {error}: install what it needs; Gymnasium's own come "
-            'with its extras, as pip install "gymnasium[mujoco]"'
-        ) from None
+        newest = _newest_version(env_id)
+        way = (
+            "install what it needs; Gymnasium's own come with its extras, as pip install "
+            '"gymnasium[mujoco]"'
+            if newest == env_id
+            else f"take its newest version, {newest}"
+        )
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise MerlError(f"task {env_id!r} cannot be made: {reason}: {way}") from None
     except Exception as error:
         raise MerlError(f"task {env_id!r} cannot be made: {in_one_line(error)}") from error
+
+
+def _newest_version(env_id: str) -> str:
+    """Return the id of the newest registered version of an environment."""
+    spec = registry[env_id]
+    others = (s for s in registry.values() if (s.namespace, s.name) == (spec.namespace, spec.name))
+    return max(others, key=lambda s: s.version or 0).id

@@ -345,6 +345,7 @@ def test_an_arm_that_has_become_another_is_refused(
         (["Kitchen-v7"], "is unknown: choose from reach_duplo, move_box, lift_box, or name a"),
         (["FetchReach-v4"], "package gymnasium-robotics: pip install 'gymnasium-robotics', then"),
         (["FetchReach-v4"], "name it gymnasium_robotics:FetchReach-v4"),
+        (["Ant-v3", "--agent", "sac"], "take its newest version, Ant-v5"),
         (
             ["gymnasium_robotics:FetchReach-v4"],
             "it comes with the package gymnasium-robotics: pip install",

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import random
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -129,3 +130,17 @@ def test_the_seed_of_an_episode_seeds_the_global_generators_of_its_process() -> 
         seed_global_generators(3)
         environment(None)
         assert drawn() == seeded[0]
+
+
+@pytest.mark.parametrize(
+    "hold",
+    [lambda rng: [rng], lambda rng: {"noise": rng}, lambda rng: SimpleNamespace(rng=rng)],
+    ids=["list", "dict", "object"],
+)
+def test_generators_in_containers_are_restored(hold: Any) -> None:
+    env, rng = DotEnv(), np.random.default_rng(3)
+    env.kept = hold(rng)  # type: ignore[attr-defined]
+    before = rng.bit_generator.state
+    with kept_generators(env):
+        rng.random(5)
+    assert rng.bit_generator.state == before

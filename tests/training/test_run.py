@@ -17,7 +17,7 @@ from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import compose
 from merl.training.config import TrainConfig
 from merl.training.run import Run
-from merl.training.run_folder import LOCK_FILE
+from merl.training.run_folder import LOCK_FILE, check_links
 from toy import DotEnv
 
 CONFIG = compose("smoke", "reach_duplo")
@@ -227,3 +227,15 @@ def test_a_device_that_is_not_here_gives_way_where_auto_is_asked_for(
     record = json.loads((folder / "config.json").read_text())
     assert (record["config"]["device"], record["config"]["agent"]["precision"]) == ("cpu", "bf16")
     assert record["left_open"] == ["agent.torch_compile"]
+
+
+def test_a_loop_of_links_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(MerlError, match="is a link"):
+        check_links(tmp_path)
+
+
+def test_a_config_that_is_nested_too_deeply_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("[" * 100_000)
+    with pytest.raises(MerlError, match="cannot be read"):
+        Run.open(tmp_path)

@@ -136,3 +136,13 @@ def test_handlers_are_left_alone_in_another_thread() -> None:
     thread.start()
     thread.join()
     assert done == [True]
+
+
+def test_a_call_that_takes_the_wakeup_descriptor_and_the_handler_loses_no_later_signal() -> None:
+    with Interrupt().listening() as interrupt:
+        with handlers_kept():
+            signal.set_wakeup_fd(-1)
+        with handlers_kept():
+            signal.signal(signal.SIGUSR1, lambda *_: None)
+            os.kill(os.getpid(), signal.SIGUSR1)
+        assert interrupt.number == signal.SIGUSR1

@@ -212,8 +212,8 @@ def evaluate(
         reset: called before each episode.
         video: where to film the first episode.
         tick: called after every step, with the number of the episode; may raise to end it.
-        warn: receives warnings (default: Python's). If the video cannot be made, the evaluation
-            goes on without it and warns; without `warn` that is an error.
+        warn: receives warnings (default: Python's). A video that cannot be made is a
+            warning; without `warn` it is an error.
         max_steps: steps after which an episode is cut, as by a time limit, with a warning.
         reports_success: the environment is known to report success, see `summarize`.
 

@@ -140,7 +140,7 @@ class Evaluations:
         raise failure from error
 
     def _leave_out(self, why: str) -> None:
-        """Go on without the evaluation that is due."""
+        """Leave out the evaluation that is due."""
         progress = self._parts.progress
         progress.evaluated, progress.attempts = progress.step, 1
         self._view.warn(

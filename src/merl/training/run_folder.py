@@ -45,7 +45,7 @@ def run_path(config: TrainConfig, home: Path | None = None) -> Path:
 
 
 def resume_line(folder: Path) -> str:
-    """What to type to go on with a run."""
+    """Return the command that resumes a run."""
     return f"{program()} resume {shlex.quote(str(folder))}"
 
 

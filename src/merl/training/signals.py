@@ -92,7 +92,7 @@ class Interrupt:
             raise Stopped(number)
         self._telling = Timer(PATIENCE, _tell)
         self._telling.daemon = True
-        with suppress(RuntimeError):  # no thread is to be had: saving matters more
+        with suppress(RuntimeError):  # no thread can be started: saving matters more
             self._telling.start()
 
     @contextmanager

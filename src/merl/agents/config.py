@@ -39,6 +39,9 @@ class AgentConfig:
     """What it falls to, in a straight line over `noise_steps`; it stays as it is, if not set."""
     noise_steps: int = 500_000
     """Environment steps over which it falls."""
+    noise_correlation: float = 0.0
+    """How much of the exploration noise stays from one action to the next, in [0, 1); its standard
+    deviation is the same. In updates the noise is drawn anew."""
     noise_clip: float = 0.3
     """Bound of the noise in both updates; when acting it is not clipped."""
     target: Target = "heads"
@@ -97,6 +100,10 @@ class AgentConfig:
                 raise MerlError(
                     f"agent.{_flag(name)} must be at least 0, not {getattr(self, name)}"
                 )
+        if not 0 <= self.noise_correlation < 1:
+            raise MerlError(
+                f"agent.noise-correlation must lie in [0, 1), not {self.noise_correlation}"
+            )
         if not self.noise_clip >= 0:
             raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
         least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1, "noise_steps": 1}

@@ -84,6 +84,7 @@ class DDPG:
     ) -> None:
         self.step = 0
         self.sigma: Tensor | None = None
+        self.acting_noise: Tensor | None = None
         self.config = config
         self.device, self.threads = device, threads
         self.networks = networks.to(device)
@@ -127,6 +128,11 @@ class DDPG:
         if not explore:
             return mean
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
+        correlation = self.config.noise_correlation
+        if correlation:
+            last = self.acting_noise if self.acting_noise is not None else noise
+            noise = correlation * last + (1 - correlation**2) ** 0.5 * noise
+            self.acting_noise = noise
         return (mean + self.config.noise(self.step) * noise).clamp(-1.0, 1.0)
 
     # Learning -------------------------------------------------------------------------------
@@ -254,6 +260,7 @@ class DDPG:
             "actor_optimizer": self.actor_optimizer.state_dict(),
             "acting": self.acting.get_state(),
             "learning": self.learning.get_state(),
+            "acting_noise": self.acting_noise,
         }
 
     @with_torch_settings
@@ -261,6 +268,8 @@ class DDPG:
         """Take back what `state_dict` gave."""
         self.networks.load_state_dict(state["networks"])
         self.critic_target.load_state_dict(state["critic_target"])
+        noise = state.get("acting_noise")
+        self.acting_noise = None if noise is None else noise.to(self.device)
         load_optimizer(self.critic_optimizer, state["critic_optimizer"])
         load_optimizer(self.actor_optimizer, state["actor_optimizer"])
         for name in ("acting", "learning"):

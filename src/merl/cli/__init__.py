@@ -92,8 +92,10 @@ def _run(args: list[str]) -> int:
         return 128 + getattr(stop, "number", signal.SIGINT)
 
 
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """A warning is for the user: one line, without the place in the source."""
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    """Show a warning in one line, without its place in the source; not those for developers."""
+    if issubclass(category, DeprecationWarning):
+        return
     text = " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(message)).split())  # some come in colours
     if text:
         print(f"merl: warning: {text}", file=sys.stderr)

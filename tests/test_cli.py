@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
 import hashlib
 import io
 import json
@@ -163,6 +164,19 @@ def test_evaluating_with_the_other_renderer_warns(run: Path) -> None:
     policy = merl.load_policy(run)
     with pytest.warns(UserWarning, match="trained with renderer 'warp'"), _closing_gl():
         policy.make_env(renderer="gl", observations=("proprio",)).close()
+
+
+def test_evaluating_with_gl_takes_one_sample(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, made = merl.load_policy(run), list[dict[str, object]]()
+    seen = dataclasses.replace(policy.config.env, renderer="raster", samples=2)
+    policy.config = dataclasses.replace(policy.config, env=seen)
+    monkeypatch.setattr(
+        "merl.training.evaluation.make_run_env", lambda config, **changes: made.append(changes)
+    )
+    with pytest.warns(UserWarning, match="trained with renderer 'raster'"):
+        policy.make_env(renderer="gl")
+    policy.make_env(renderer="raster")
+    assert made == [{"renderer": "gl", "samples": 1}, {"renderer": "raster"}]
 
 
 def test_auto_is_the_renderer_of_the_training(run: Path, recwarn: pytest.WarningsRecorder) -> None:
@@ -367,6 +381,8 @@ BAD = {
     "train reach_duplo --agent.vectors joints": "the environment gives ['proprio', 'state']",
     "train reach_duplo --image-size 8": "16",
     "train reach_duplo --renderer wrap": "'raster', 'warp'",
+    "train reach_duplo --renderer raster --samples 5": "samples is 5: give a whole number",
+    "train reach_duplo --renderer gl --samples 2": "use renderer raster, or samples 1",
     "train reach_duplo --start around": "is solved where the hand starts around",
     "train move_box --preset smoke --start around --occluded": "occluded needs --start above",
     "train reach_duplo --reward staged": "only 'paper'",

@@ -189,6 +189,13 @@ def test_a_bad_action_moves_nothing(blind, action, message):
         ("reach_duplo", {"image_size": 15}, "image_size is 15: .* at least 16"),
         ("reach_duplo", {"image_size": 84.0}, "image_size is 84.0"),
         ("reach_duplo", {"render_size": 0}, "render_size is 0"),
+        ("reach_duplo", {"renderer": "raster", "samples": 5}, "samples is 5: .* at most 4"),
+        ("reach_duplo", {"renderer": "raster", "samples": 4, "image_size": 600}, "at most 2048"),
+        (
+            "reach_duplo",
+            {"renderer": "gl", "samples": 2},
+            "samples is 2, and renderer 'gl' takes one .*: use renderer raster, or samples 1",
+        ),
         ("reach_duplo", {"observations": ()}, r"observations is \(\): give a tuple"),
         ("reach_duplo", {"observations": "image"}, "observations is 'image': give a tuple"),
         ("reach_duplo", {"rendrer": "warp"}, "no setting 'rendrer': did you mean 'renderer'"),
@@ -273,6 +280,7 @@ def test_every_setting_is_a_plain_value():
     assert {field.name: field.default for field in fields(EnvConfig)} == {
         "renderer": "auto",
         "image_size": 84,
+        "samples": 1,
         "proprio": "paper",
         "state": "absolute",
         "observations": ("image", "proprio"),

@@ -16,6 +16,7 @@ from merl.envs.config import EnvConfig
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
 from merl.training.plain import from_plain, to_plain
+from merl.training.resuming import taken_up
 from toy import DotEnv
 
 WARP = EnvConfig(renderer="warp", image_size=32)
@@ -25,6 +26,31 @@ def test_recorded_config_names_the_renderer_that_draws() -> None:
     plain = to_plain(TrainConfig("reach_duplo", env=EnvConfig()))["env"]
     assert plain["renderer"] == "warp"
     assert from_plain(EnvConfig, plain | {"renderer": "auto"}).renderer == "warp"
+
+
+def test_samples_are_recorded_and_older_records_have_one() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    plain = to_plain(TrainConfig("reach_duplo", env=env))["env"]
+    assert plain["samples"] == 3
+    assert from_plain(EnvConfig, plain) == env
+    del plain["samples"]
+    assert from_plain(EnvConfig, plain) == dataclasses.replace(env, samples=1)
+
+
+def test_resume_refuses_other_samples() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    recorded = TrainConfig("reach_duplo", env=env)
+    other = dataclasses.replace(recorded, env=dataclasses.replace(env, samples=2))
+    with pytest.raises(MerlError, match=r"cannot go on with env.samples 3 -> 2"):
+        taken_up(recorded, other)
+
+
+def test_samples_reach_the_environment_of_a_run() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    made = make_run_env(TrainConfig("reach_duplo", env=env))
+    assert made.reset(seed=0)[0]["image"].shape == (24, 24, 3)
+    assert made.unwrapped.config.samples == 3  # type: ignore[attr-defined]
+    made.close()
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ FloorName = Literal["rough", "smooth"]
 ImageLayout = Literal["auto", "hwc", "chw"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
+MOST_SAMPLES = 4
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,11 @@ class EnvConfig:
 
     image_size: int = 84
     """Height and width of the agent's picture, in pixels; from 16 to 2048."""
+
+    samples: int = 1
+    """Samples along each edge of a pixel of the agent's image, 1 to 4, for renderer `raster`; the pixel
+    is their average. An image takes as long as one of `samples` times its size: 24 pixels
+    with 3 samples as long as 72 with 1."""
 
     proprio: ProprioName = "paper"
     """What the robot feels: `paper` (angles and velocities of arm and fingers, 24 numbers) or
@@ -90,13 +96,41 @@ class EnvConfig:
             )
         for name in self.start:
             check_choice("start", name, starts)
-        for field in ("image_size", "render_size"):
-            size = getattr(self, field)
-            if type(size) is not int or not SMALLEST_IMAGE <= size <= LARGEST_IMAGE:
-                raise MerlError(
-                    f"{field} is {size!r}: give a whole number, at least {SMALLEST_IMAGE} and at "
-                    f"most {LARGEST_IMAGE}"
-                )
+        check_whole("image_size", self.image_size, SMALLEST_IMAGE, LARGEST_IMAGE)
+        check_whole("render_size", self.render_size, SMALLEST_IMAGE, LARGEST_IMAGE)
+        check_samples(self.samples, self.image_size)
+        if self.samples != 1 and self.renderer != "raster":
+            raise MerlError(
+                f"samples is {self.samples}, and renderer {self.renderer!r} takes one sample per "
+                "pixel: use renderer raster, or samples 1"
+            )
+
+
+def check_whole(name: str, value: int, least: int, most: int) -> None:
+    """Reject a value that is not a whole number from `least` to `most`.
+
+    Raises:
+        MerlError: naming the value and the bounds.
+    """
+    if type(value) is not int or not least <= value <= most:
+        raise MerlError(
+            f"{name} is {value!r}: give a whole number, at least {least} and at most {most}"
+        )
+
+
+def check_samples(samples: int, size: int) -> None:
+    """Reject samples per pixel edge that are out of range for an image of `size` pixels an edge.
+
+    Raises:
+        MerlError: naming the value and the bounds.
+    """
+    check_whole("samples", samples, 1, MOST_SAMPLES)
+    if samples * size > LARGEST_IMAGE:
+        raise MerlError(
+            f"samples is {samples} at {size} pixels, which is {samples * size} samples along an "
+            f"edge of the image: at most {LARGEST_IMAGE} are possible, so use fewer samples or a "
+            "smaller image"
+        )
 
 
 @dataclass(frozen=True)

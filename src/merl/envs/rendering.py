@@ -33,7 +33,9 @@ class Renderer(Protocol):
         ...
 
 
-def make_renderer(name: RendererChoice, physics: Any, camera: str, size: int) -> Renderer:
+def make_renderer(
+    name: RendererChoice, physics: Any, camera: str, size: int, samples: int = 1
+) -> Renderer:
     """Make a renderer by its name.
 
     Args:
@@ -41,16 +43,15 @@ def make_renderer(name: RendererChoice, physics: Any, camera: str, size: int) ->
         physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
         camera: the name of a camera in the model.
         size: height and width of the pictures, in pixels.
+        samples: along each edge of a pixel, for `raster`; `EnvConfig` checks it.
 
     Raises:
         MerlError: `gl`, and no OpenGL library works; `raster`, and a geom cannot be drawn.
     """
-    renderers: dict[str, type[Renderer]] = {
-        "gl": GlRenderer,
-        "raster": RasterRenderer,
-        "warp": WarpRenderer,
-    }
-    return renderers[name](physics, camera, size)
+    if name == "raster":
+        return RasterRenderer(physics, camera, size, samples)
+    others: dict[str, type[Renderer]] = {"gl": GlRenderer, "warp": WarpRenderer}
+    return others[name](physics, camera, size)
 
 
 def check_renderer(name: RendererChoice) -> None:

@@ -46,7 +46,7 @@ FORMS: list[tuple[str, dict[str, Any]]] = [
 
 def measure(task: str, settings: dict[str, Any], episodes: int) -> list[dict[str, object]]:
     """The rows of one task in one form."""
-    env = make_env(task, renderer="warp", observations=("proprio",), **settings)
+    env = make_env(task, renderer="raster", observations=("proprio",), **settings)
     rng = np.random.default_rng(0)
     expert = ExpertPolicy(env)
     policies = {

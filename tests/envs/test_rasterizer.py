@@ -64,7 +64,7 @@ def every_geom():
 @pytest.fixture(params=TASKS)
 def task(request):
     """A physics of each task after some random steps."""
-    env = make_env(request.param, renderer="warp", observations=("proprio",))
+    env = make_env(request.param, renderer="raster", observations=("proprio",))
     env.reset(seed=3)
     action = np.random.default_rng(2).uniform(-1, 1, 9).astype(np.float32)
     for _ in range(20):

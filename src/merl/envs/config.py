@@ -7,12 +7,12 @@ from typing import Literal, get_args
 
 from merl.core import MerlError, check_choice
 
-RendererName = Literal["gl", "raster", "warp"]
-RendererChoice = Literal["auto", "gl", "raster", "warp"]
-AUTO_RENDERER: RendererName = "warp"
-"""The renderer that `auto` stands for: the only one that works on every machine, and the faster one
+RendererName = Literal["gl", "raster"]
+RendererChoice = Literal["auto", "gl", "raster"]
+AUTO_RENDERER: RendererName = "raster"
+"""The renderer that `auto` stands for: the one that works on every machine, and the faster one
 where both were measured (docs/bench.md). It does not depend on the machine, so the same code sees
-the same pictures everywhere."""
+the same images everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
@@ -22,6 +22,8 @@ ImageLayout = Literal["auto", "hwc", "chw"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 MOST_SAMPLES = 4
+REMOVED = {("renderer", "warp"): "renderer raster"}
+"""Values of earlier versions, which runs may have recorded, and what replaces them."""
 
 
 @dataclass(frozen=True)
@@ -29,16 +31,16 @@ class EnvConfig:
     """How an environment is seen."""
 
     renderer: RendererChoice = "auto"
-    """What draws the pictures: `gl` (OpenGL, as dm_control does), `warp` (a ray tracer that needs
-    no OpenGL and is much faster on a CPU) or `raster` (a z-buffer, seven times as fast as `warp`
-    and nearer to `gl`). To an agent they are different cameras. `auto` is replaced by `warp`."""
+    """What draws the images: `gl` (OpenGL, as dm_control does) or `raster` (a z-buffer that needs
+    no OpenGL and is much faster on a CPU). To an agent they are different cameras. `auto` is
+    replaced by `raster`."""
 
     image_size: int = 84
     """Height and width of the agent's picture, in pixels; from 16 to 2048."""
 
     samples: int = 1
-    """Samples along each edge of a pixel of the agent's image, 1 to 4, for renderer `raster`; the pixel
-    is their average. An image takes as long as one of `samples` times its size: 24 pixels
+    """Samples along each edge of a pixel of the agent's image, 1 to 4, for renderer `raster`; a
+    pixel is their average. An image takes as long as one of `samples` times its size: 24 pixels
     with 3 samples as long as 72 with 1."""
 
     proprio: ProprioName = "paper"
@@ -75,6 +77,7 @@ class EnvConfig:
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
 
     def __post_init__(self) -> None:
+        check_not_removed("renderer", self.renderer)
         check_choice("renderer", self.renderer, get_args(RendererChoice))
         if self.renderer == "auto":  # a config, and so a run's record, names what really draws
             object.__setattr__(self, "renderer", AUTO_RENDERER)
@@ -104,6 +107,19 @@ class EnvConfig:
                 f"samples is {self.samples}, and renderer {self.renderer!r} takes one sample per "
                 "pixel: use renderer raster, or samples 1"
             )
+
+
+def check_not_removed(name: str, value: str) -> None:
+    """Reject a value that earlier versions of merl had.
+
+    Raises:
+        MerlError: naming the value and the way out.
+    """
+    if (name, value) in REMOVED:
+        raise MerlError(
+            f"{name} {value!r} no longer exists: train anew with {REMOVED[name, value]}, or use "
+            "the version of merl that the run was trained with"
+        )
 
 
 def check_whole(name: str, value: int, least: int, most: int) -> None:

@@ -34,13 +34,10 @@ PUBLISHED = {
 }
 
 
-EASIER = {"start": ("around", "holding"), "reward": "both", "floor": "smooth"}
-"""What is learnt from the state (docs/tasks.md)."""
 FORMS: list[tuple[str, dict[str, Any]]] = [
     *((task, {}) for task in TASKS),
     *((task, {"reward": "staged"}) for task in BOX_TASKS),
     *((task, {"occluded": True}) for task in BOX_TASKS),
-    *((task, EASIER) for task in BOX_TASKS),
 ]
 
 

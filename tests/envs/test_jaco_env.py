@@ -188,6 +188,9 @@ def test_a_bad_action_moves_nothing(blind, action, message):
             "'vulkan' is unknown: choose from auto, gl, raster",
         ),
         ("reach_duplo", {"renderer": "warp"}, "renderer 'warp' no longer exists: .* raster"),
+        ("reach_duplo", {"renderer": ["gl"]}, "is unknown: choose from auto, gl, raster"),
+        ("move_box", {"reward": "far"}, "reward 'far' no longer exists: .* paper or staged"),
+        ("move_box", {"reward": "steep"}, "reward 'steep' is unknown: choose from paper, staged"),
         ("reach_duplo", {"proprio": "some"}, "proprio 'some' is unknown"),
         ("reach_duplo", {"image_size": 15}, "image_size is 15: .* at least 16"),
         ("reach_duplo", {"image_size": 84.0}, "image_size is 84.0"),
@@ -290,6 +293,5 @@ def test_every_setting_is_a_plain_value():
         "occluded": False,
         "start": ("above",),
         "reward": "paper",
-        "floor": "rough",
         "render_size": 480,
     }

@@ -29,16 +29,16 @@ def recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     for name in ("commit", "machine", "package_versions"):
         monkeypatch.setattr(f"merl.training.run.{name}", dict)
 
-    def record(task: str, senses: spaces.Dict, **env: Any) -> Path:
+    def record(task: str, senses: spaces.Dict, folder: str = "run", **env: Any) -> Path:
         agent = "merl_state" if senses is STATE else "merl"
-        config = dataclasses.replace(compose("smoke", task, agent), run_dir=tmp_path / "run")
+        config = dataclasses.replace(compose("smoke", task, agent), run_dir=tmp_path / folder)
         with Run.begin(config, senses, ACTION):
             pass
-        file = tmp_path / "run" / CONFIG_FILE
+        file = tmp_path / folder / CONFIG_FILE
         plain = json.loads(file.read_text())
         plain["config"]["env"].update(env)
         file.write_text(json.dumps(plain))
-        return tmp_path / "run"
+        return tmp_path / folder
 
     return record
 
@@ -47,6 +47,26 @@ def test_a_run_that_saw_images_of_a_removed_renderer_is_refused(recorded: Any) -
     with pytest.raises(MerlError, match=r"renderer 'warp' no longer exists: .*raster") as error:
         Run.open(recorded("reach_duplo", SENSES, renderer="warp"))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("reward", "near"), ("reward", "far"), ("reward", "both"), ("floor", "smooth")],
+)
+def test_a_run_of_a_removed_form_of_a_task_is_refused(
+    recorded: Any, field: str, value: str
+) -> None:
+    with pytest.raises(MerlError, match=f"{field} '{value}' no longer exists: train") as error:
+        Run.open(recorded("move_box", STATE, **{field: value}))
+    assert "\n" not in str(error.value)
+
+
+def test_a_run_on_the_floor_that_is_left_is_opened(recorded: Any) -> None:
+    folder = recorded("move_box", SENSES, floor="rough", reward="staged")
+    run = Run.open(folder)
+    assert run.config.env == dataclasses.replace(compose("smoke", "move_box").env, reward="staged")
+    with pytest.raises(MerlError, match="floor 'wet' is unknown"):
+        Run.open(recorded("lift_box", SENSES, folder="other", floor="wet"))
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,18 @@ the same images everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
-RewardName = Literal["paper", "staged", "near", "far", "both"]
-FloorName = Literal["rough", "smooth"]
+RewardName = Literal["paper", "staged"]
 ImageLayout = Literal["auto", "hwc", "chw"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 MOST_SAMPLES = 4
-REMOVED = {("renderer", "warp"): "renderer raster"}
+REMOVED = {
+    "renderer 'warp'": "renderer raster",
+    "reward 'near'": "reward paper or staged",
+    "reward 'far'": "reward paper or staged",
+    "reward 'both'": "reward paper or staged",
+    "floor 'smooth'": "the rough floor",
+}
 """Values of earlier versions, which runs may have recorded, and what replaces them."""
 
 
@@ -64,14 +69,8 @@ class EnvConfig:
     several, one is drawn in each episode."""
 
     reward: RewardName = "paper"
-    """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5: full within 5 cm of the target),
-    `staged` (the authors' later code: one more term for the last centimetre), or the paper's terms
-    with another goal term: `near` (full within 1 cm, a long tail), `far` (a straight line, to 0 at
-    31 cm), `both` (their mean)."""
-
-    floor: FloorName = "rough"
-    """In `move_box` and `lift_box`: `rough` (dm_control's, a friction of 1) or `smooth` (0.2, for
-    all that touches it: box and fingers slide rather than stick)."""
+    """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5) or `staged` (the authors' later
+    code: one more term for the last centimetre)."""
 
     render_size: int = 480
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
@@ -83,8 +82,8 @@ class EnvConfig:
             object.__setattr__(self, "renderer", AUTO_RENDERER)
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
+        check_not_removed("reward", self.reward)
         check_choice("reward", self.reward, get_args(RewardName))
-        check_choice("floor", self.floor, get_args(FloorName))
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
                 f"observations is {self.observations!r}: give a tuple of at least one of "
@@ -115,10 +114,11 @@ def check_not_removed(name: str, value: str) -> None:
     Raises:
         MerlError: naming the value and the way out.
     """
-    if (name, value) in REMOVED:
+    removed = f"{name} {value!r}"
+    if removed in REMOVED:
         raise MerlError(
-            f"{name} {value!r} no longer exists: train anew with {REMOVED[name, value]}, or use "
-            "the version of merl that the run was trained with"
+            f"{removed} no longer exists: train anew with {REMOVED[removed]}, or use the version "
+            "of merl that the run was trained with"
         )
 
 

@@ -29,7 +29,7 @@ import merl
 from merl.agents import AGENTS
 from merl.agents.networks import modalities
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
-from merl.envs.config import AUTO_RENDERER
+from merl.envs.config import AUTO_RENDERER, check_not_removed
 from merl.envs.own import imports_code, load_module, module_folder
 from merl.envs.registration import ENV_IDS
 from merl.training import trust
@@ -316,17 +316,22 @@ def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
 
 
 def _updated(plain: Mapping[str, Any], space: spaces.Dict) -> Mapping[str, Any]:
-    """A recorded config without what earlier versions of merl had and this run does not depend on.
+    """Rewrite a recorded config without fields and values that merl no longer has.
 
-    The renderer does not matter where the agent sees no image of merl's own tasks.
+    The renderer of a run whose agent sees no image of merl's own tasks does not matter.
+
+    Raises:
+        MerlError: the run depends on a value that no longer exists.
     """
     env = plain.get("env")
     if not isinstance(env, dict):
         return plain
     env = dict(env)
-    if env.get("renderer") == "warp" and (
-        plain["task"] not in ENV_IDS or "image" not in space.spaces
-    ):
+    floor = env.pop("floor", "rough")
+    check_not_removed("floor", floor)
+    check_choice("floor", floor, ("rough",))
+    is_drawn = plain["task"] in ENV_IDS and "image" in space.spaces
+    if env.get("renderer") == "warp" and not is_drawn:
         env["renderer"] = AUTO_RENDERER
     return {**plain, "env": env}
 

@@ -30,7 +30,7 @@ def main() -> None:
     """Measure and print."""
     torch.set_num_threads(1)
     for preset, task, size in (("laptop", "reach_duplo", 48), ("paper", "move_box", 84)):
-        env = make_env(task, renderer="warp", image_size=size)
+        env = make_env(task, renderer="raster", image_size=size)
         space, actions = env.observation_space, env.action_space
         assert isinstance(space, spaces.Dict)
         assert isinstance(actions, spaces.Box)

@@ -103,7 +103,7 @@ def sides(repeats: int) -> Iterator[Row]:
     with ExitStack() as stack:
         for side in SIDES:
             works["update of 128", side] = _update(128, side)
-            env = make_env("reach_duplo", renderer="warp", image_size=side)
+            env = make_env("reach_duplo", renderer="raster", image_size=side)
             stack.callback(env.close)
             env.reset(seed=0)
             works["step with its picture", side] = partial(env.step, np.zeros(ACTIONS, np.float32))
@@ -174,7 +174,7 @@ def _update(size: int, side: int) -> Work:
 
 def _arm() -> list[dict[str, Any]]:
     """What an arm that is moved at random sees in an episode."""
-    env = make_env("reach_duplo", renderer="warp")
+    env = make_env("reach_duplo", renderer="raster")
     observation, _ = env.reset(seed=0)
     seen = [observation]
     for _ in range(EPISODE):

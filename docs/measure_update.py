@@ -34,7 +34,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 def main() -> None:
     """Measure and print."""
     torch.set_num_threads(1)
-    env = make_env("reach_duplo", renderer="warp", image_size=48)
+    env = make_env("reach_duplo", renderer="raster", image_size=48)
     space, actions = env.observation_space, env.action_space
     assert isinstance(space, gymnasium.spaces.Dict)
     assert isinstance(actions, gymnasium.spaces.Box)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
 import hashlib
 import io
 import json
@@ -79,7 +80,7 @@ def rows(run: Path) -> list[dict[str, str]]:
 
 def test_a_run_leaves_what_the_docs_promise(run: Path) -> None:
     record = json.loads((run / "config.json").read_text())
-    assert record["config"]["env"]["renderer"] == "warp"
+    assert record["config"]["env"]["renderer"] == "raster"
     assert record["config"]["agent"]["precision"] in ("fp32", "bf16")
     assert record["versions"]["mujoco"] == "3.17.0"
     assert (record["task"], record["preset"], record["seed"]) == ("reach_duplo", "smoke", 0)
@@ -123,7 +124,7 @@ def test_evaluate_and_a_policy_driven_by_hand_agree_exactly(run: Path, tmp_path:
     assert told["step"] == 1000
 
     policy = merl.load_policy(run)
-    env = merl.make_env("reach_duplo", renderer="warp", image_size=32)
+    env = merl.make_env("reach_duplo", renderer="raster", image_size=32)
     for index, episode in enumerate(told["episodes"]):
         assert episode["seed"] == EVALUATION_SEED + index
         observation, _ = env.reset(seed=episode["seed"])
@@ -161,14 +162,27 @@ def test_a_policy_says_what_it_misses(run: Path) -> None:
 
 def test_evaluating_with_the_other_renderer_warns(run: Path) -> None:
     policy = merl.load_policy(run)
-    with pytest.warns(UserWarning, match="trained with renderer 'warp'"), _closing_gl():
+    with pytest.warns(UserWarning, match="trained with renderer 'raster'"), _closing_gl():
         policy.make_env(renderer="gl", observations=("proprio",)).close()
+
+
+def test_evaluating_with_gl_takes_one_sample(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, made = merl.load_policy(run), list[dict[str, object]]()
+    seen = dataclasses.replace(policy.config.env, samples=2)
+    policy.config = dataclasses.replace(policy.config, env=seen)
+    monkeypatch.setattr(
+        "merl.training.evaluation.make_run_env", lambda config, **changes: made.append(changes)
+    )
+    with pytest.warns(UserWarning, match="trained with renderer 'raster'"):
+        policy.make_env(renderer="gl")
+    policy.make_env(renderer="raster")
+    assert made == [{"renderer": "gl", "samples": 1}, {"renderer": "raster"}]
 
 
 def test_auto_is_the_renderer_of_the_training(run: Path, recwarn: pytest.WarningsRecorder) -> None:
     policy = merl.load_policy(run)
     env = policy.make_env(renderer="auto", observations=("proprio",))
-    assert env.unwrapped.config.renderer == policy.config.env.renderer == "warp"  # type: ignore[attr-defined]
+    assert env.unwrapped.config.renderer == policy.config.env.renderer == "raster"  # type: ignore[attr-defined]
     env.close()
     assert not list(recwarn)
 
@@ -366,11 +380,13 @@ BAD = {
     "train reach_duplo --num-envs 0": "num-envs must be at least 1 and at most 1,024, not 0",
     "train reach_duplo --agent.vectors joints": "the environment gives ['proprio', 'state']",
     "train reach_duplo --image-size 8": "16",
-    "train reach_duplo --renderer wrap": "'raster', 'warp'",
+    "train reach_duplo --renderer wrap": "'gl', 'raster'",
+    "train reach_duplo --renderer raster --samples 5": "samples is 5: give a whole number",
+    "train reach_duplo --renderer gl --samples 2": "use renderer raster, or samples 1",
     "train reach_duplo --start around": "is solved where the hand starts around",
     "train move_box --preset smoke --start around --occluded": "occluded needs --start above",
     "train reach_duplo --reward staged": "only 'paper'",
-    "train reach_duplo --floor smooth": "has a rough floor",
+    "train move_box --preset smoke --reward near": "'paper', 'staged'",
     "train reach_duplo --minutes 0": "minutes must be above 0",
     "trian reach_duplo": "did you mean 'train'",
     "evaluate nowhere": "is not a run",
@@ -432,7 +448,7 @@ def test_what_is_to_be_written_is_as_it_was_until_then(tmp_path: Path) -> None:
 def test_what_may_be_left_out_is_not_offered_as_none(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "nowhere", "--renderer", "wrap"]) == 2
     error = capsys.readouterr().err
-    assert "'warp'" in error
+    assert "'raster'" in error
     assert "None" not in error
 
 
@@ -485,7 +501,7 @@ def test_gl_without_opengl_names_the_way_on(tmp_path: Path, opengl: dict[str, st
     )
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
-    assert "warp" in done.stderr
+    assert "--renderer raster" in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -579,6 +595,11 @@ def test_ctrl_c_before_training_says_that_nothing_was_written(
         (lambda record: record["config"]["agent"].update(conv_strides=[2, "1"]), "strides is '1'"),
         (lambda record: record["config"].update(seed=True), "seed is True"),
         (lambda record: record["config"]["env"].update(goal="near"), "goal is not known to this"),
+        (
+            lambda record: record["config"]["env"].update(renderer="warp"),
+            "renderer 'warp' no longer exists: train anew with renderer raster, or use the version",
+        ),
+        (lambda record: record["config"]["env"].update(reward="near"), "reward 'near' no longer"),
         (lambda record: record.pop("machine"), "it has no 'machine'"),
         (lambda record: record.update(resumed=3), "cannot be read"),
         (lambda record: record.update(format=99), "it has format 99"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import multiprocessing
 import os
 import re
 import sys
@@ -13,11 +12,7 @@ from contextlib import chdir
 from importlib import import_module
 from pathlib import Path
 
-MOST_PICTURE_THREADS = 4
-"""What a picture of an arm's camera can make use of."""
-
 _ZEROS = bytes(1 << 20)
-_allowed_threads: int | None = None
 
 
 def available_memory(root: Path = Path("/")) -> int:
@@ -57,24 +52,6 @@ def keep_freed_memory(keep: bool = True) -> bool:
     except (OSError, AttributeError):
         return False
     return all(mallopt(name, value) for name, value in values.items())
-
-
-def allow_picture_threads(count: int | None) -> None:
-    """Let a picture be drawn by so many threads of this process.
-
-    Args:
-        count: None for one for each core, or a single one in a process that another has started,
-            as those of vectorized environments are.
-    """
-    global _allowed_threads
-    _allowed_threads = count
-
-
-def picture_threads() -> int:
-    """How many threads may draw a picture, `MOST_PICTURE_THREADS` at most."""
-    is_child = multiprocessing.parent_process() is not None
-    allowed = _allowed_threads or (1 if is_child else len(os.sched_getaffinity(0)))
-    return max(1, min(allowed, MOST_PICTURE_THREADS))
 
 
 def free_disk(directory: Path) -> int:

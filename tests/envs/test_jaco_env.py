@@ -19,7 +19,7 @@ ACTION = np.zeros(9, np.float32)
 @pytest.fixture(scope="module")
 def blind():
     """An environment without pictures, which is fast."""
-    env = make_env("reach_duplo", renderer="warp", observations=("proprio", "state"))
+    env = make_env("reach_duplo", renderer="raster", observations=("proprio", "state"))
     yield env
     env.close()
 
@@ -47,7 +47,7 @@ def episode(env, steps=5, action_seed=0, **reset):
 )
 def test_gymnasium_finds_nothing_wrong(task, config):
     config = {**config, "observations": ("image", "proprio", "state")}
-    env = make_env(task, renderer="warp", image_size=32, render_mode="rgb_array", **config)
+    env = make_env(task, renderer="raster", image_size=32, render_mode="rgb_array", **config)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for known in ("Box observation space m", "environment not having a spec"):
@@ -57,7 +57,7 @@ def test_gymnasium_finds_nothing_wrong(task, config):
 
 
 def test_spaces():
-    env = make_env("reach_duplo", renderer="warp", observations=("image", "proprio", "state"))
+    env = make_env("reach_duplo", renderer="raster", observations=("image", "proprio", "state"))
     spaces = env.observation_space.spaces
     assert {key: (space.shape, space.dtype) for key, space in spaces.items()} == {
         "image": ((84, 84, 3), np.uint8),
@@ -78,7 +78,7 @@ def test_a_seed_alone_decides_the_start(blind):
     again = episode(blind, seed=7)
     assert all(same(a, b) for a, b in zip(first, again, strict=True))
     assert not same(first[0], other[0])
-    with_picture = make_env("reach_duplo", renderer="warp", observations=("image", "state"))
+    with_picture = make_env("reach_duplo", renderer="raster", observations=("image", "state"))
     elsewhere = episode(with_picture, seed=7)
     assert all(
         np.array_equal(a["state"], b["state"]) for a, b in zip(first, elsewhere, strict=True)
@@ -91,7 +91,7 @@ def test_episodes_differ_and_can_be_taken_up_again(blind):
     state = blind.np_random.bit_generator.state
     second, third = episode(blind), episode(blind)
     assert not same(second[0], third[0])
-    another = make_env("reach_duplo", renderer="warp", observations=("proprio", "state"))
+    another = make_env("reach_duplo", renderer="raster", observations=("proprio", "state"))
     another.np_random.bit_generator.state = state
     assert all(same(a, b) for a, b in zip(second, episode(another), strict=True))
     assert all(same(a, b) for a, b in zip(third, episode(another), strict=True))
@@ -100,7 +100,7 @@ def test_episodes_differ_and_can_be_taken_up_again(blind):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_an_episode_ends_by_truncation_at_250_steps(task):
-    env = make_env(task, renderer="warp", observations=("proprio",))
+    env = make_env(task, renderer="raster", observations=("proprio",))
     env.reset(seed=0)
     for step in range(1, 251):
         _, reward, terminated, truncated, info = env.step(ACTION)
@@ -116,8 +116,10 @@ def test_an_episode_ends_by_truncation_at_250_steps(task):
 @pytest.mark.parametrize("task", TASKS)
 def test_a_seed_gives_the_same_episode_whatever_is_observed(task):
     environments = [
-        make_env(task, renderer="warp", image_size=16, observations=("image", "proprio", "state")),
-        make_env(task, renderer="warp", proprio="full", observations=("proprio", "state")),
+        make_env(
+            task, renderer="raster", image_size=16, observations=("image", "proprio", "state")
+        ),
+        make_env(task, renderer="raster", proprio="full", observations=("proprio", "state")),
     ]
     one, other = (episode(env, seed=5) for env in environments)
     for a, b in zip(one, other, strict=True):
@@ -183,18 +185,29 @@ def test_a_bad_action_moves_nothing(blind, action, message):
         (
             "reach_duplo",
             {"renderer": "vulkan"},
-            "'vulkan' is unknown: choose from auto, gl, raster, warp",
+            "'vulkan' is unknown: choose from auto, gl, raster",
         ),
+        ("reach_duplo", {"renderer": "warp"}, "renderer 'warp' no longer exists: .* raster"),
+        ("reach_duplo", {"renderer": ["gl"]}, "is unknown: choose from auto, gl, raster"),
+        ("move_box", {"reward": "far"}, "reward 'far' no longer exists: .* paper or staged"),
+        ("move_box", {"reward": "steep"}, "reward 'steep' is unknown: choose from paper, staged"),
         ("reach_duplo", {"proprio": "some"}, "proprio 'some' is unknown"),
         ("reach_duplo", {"image_size": 15}, "image_size is 15: .* at least 16"),
         ("reach_duplo", {"image_size": 84.0}, "image_size is 84.0"),
         ("reach_duplo", {"render_size": 0}, "render_size is 0"),
+        ("reach_duplo", {"renderer": "raster", "samples": 5}, "samples is 5: .* at most 4"),
+        ("reach_duplo", {"renderer": "raster", "samples": 4, "image_size": 600}, "at most 2048"),
+        (
+            "reach_duplo",
+            {"renderer": "gl", "samples": 2},
+            "samples is 2, and renderer 'gl' takes one .*: use renderer raster, or samples 1",
+        ),
         ("reach_duplo", {"observations": ()}, r"observations is \(\): give a tuple"),
         ("reach_duplo", {"observations": "image"}, "observations is 'image': give a tuple"),
-        ("reach_duplo", {"rendrer": "warp"}, "no setting 'rendrer': did you mean 'renderer'"),
+        ("reach_duplo", {"rendrer": "raster"}, "no setting 'rendrer': did you mean 'renderer'"),
         ("reach_duplo", {"image_size": 5000}, "image_size is 5000: .* at most 2048"),
         ("reach_duplo", {"observations": ("sound",)}, "'sound' is unknown"),
-        ("reach_duplo", {"renderer": "warp", "render_mode": "human"}, "render_mode 'human'"),
+        ("reach_duplo", {"renderer": "raster", "render_mode": "human"}, "render_mode 'human'"),
     ],
 )
 def test_a_bad_setting_gets_one_clear_line(task, config, message):
@@ -210,7 +223,7 @@ def test_what_is_not_asked_for_is_not_computed(blind, monkeypatch):
     monkeypatch.setattr(blind, "_picture", refuse)
     observation, _ = blind.reset(seed=0)
     assert list(observation) == ["proprio", "state"]
-    env = make_env("reach_duplo", renderer="warp", image_size=16, observations=("image",))
+    env = make_env("reach_duplo", renderer="raster", image_size=16, observations=("image",))
     monkeypatch.setattr(env.task, "proprio", refuse)
     assert list(env.reset(seed=0)[0]) == ["image"]
     env.close()
@@ -218,7 +231,7 @@ def test_what_is_not_asked_for_is_not_computed(blind, monkeypatch):
 
 def test_reset_after_close_opens_the_environment_again():
     env = make_env(
-        "move_box", renderer="warp", image_size=16, render_size=16, render_mode="rgb_array"
+        "move_box", renderer="raster", image_size=16, render_size=16, render_mode="rgb_array"
     )
     expected = [*episode(env, seed=3), env.render()]
     for _ in range(2):
@@ -236,7 +249,7 @@ def test_reset_after_close_opens_the_environment_again():
 def test_reset_after_close_draws_on_from_the_same_generator():
     starts = []
     for closes in (False, True):
-        env = make_env("reach_duplo", renderer="warp", observations=("state",))
+        env = make_env("reach_duplo", renderer="raster", observations=("state",))
         env.reset(seed=0)
         if closes:
             env.close()
@@ -249,7 +262,7 @@ def test_gymnasium_makes_every_task():
     register()
     register()
     assert set(ENV_IDS) == set(TASKS)
-    settings = {"renderer": "warp", "observations": ("state",), "proprio": "full"}
+    settings = {"renderer": "raster", "observations": ("state",), "proprio": "full"}
     env = gymnasium.make("merl:merl/ReachDuplo-v0", **settings)
     assert env.unwrapped.config == EnvConfig(**settings)
     assert env.reset(seed=0)[0]["state"].shape == (55,)
@@ -263,7 +276,7 @@ def test_gymnasium_makes_every_task():
 
 
 def test_auto_renderer_is_replaced_before_anything_records_it():
-    assert EnvConfig().renderer == EnvConfig(renderer="auto").renderer == "warp"
+    assert EnvConfig().renderer == EnvConfig(renderer="auto").renderer == "raster"
     assert EnvConfig(renderer="gl").renderer == "gl"
     with pytest.raises(MerlError, match="renderer"):
         EnvConfig(renderer="vulkan")
@@ -273,12 +286,12 @@ def test_every_setting_is_a_plain_value():
     assert {field.name: field.default for field in fields(EnvConfig)} == {
         "renderer": "auto",
         "image_size": 84,
+        "samples": 1,
         "proprio": "paper",
         "state": "absolute",
         "observations": ("image", "proprio"),
         "occluded": False,
         "start": ("above",),
         "reward": "paper",
-        "floor": "rough",
         "render_size": 480,
     }

@@ -64,7 +64,7 @@ def every_geom():
 @pytest.fixture(params=TASKS)
 def task(request):
     """A physics of each task after some random steps."""
-    env = make_env(request.param, renderer="warp", observations=("proprio",))
+    env = make_env(request.param, renderer="raster", observations=("proprio",))
     env.reset(seed=3)
     action = np.random.default_rng(2).uniform(-1, 1, 9).astype(np.float32)
     for _ in range(20):
@@ -135,6 +135,56 @@ def test_tasks_look_as_opengl_draws_them(task):
         assert np.abs(renderer.render().astype(int) - drawn).mean() < 4.0
         if samples == 1:
             assert (renderer.render_segmentation() == geoms).mean() > 0.995
+
+
+def box_average(image, samples):
+    size = len(image) // samples
+    return image.reshape(size, samples, size, samples, 3).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize(("size", "samples"), [(24, 3), (32, 2), (32, 4), (17, 1)])
+def test_samples_are_the_box_average_of_a_larger_image(every_geom, size, samples):
+    image = RasterRenderer(every_geom, "view", size, samples).render()
+    larger = RasterRenderer(every_geom, "view", size * samples).render()
+    np.testing.assert_allclose(image, box_average(larger, samples), atol=1)
+    if samples > 1:  # and not one of the samples
+        assert np.abs(image - larger[::samples, ::samples].astype(int)).mean() > 3
+
+
+@pytest.mark.parametrize(("size", "samples"), [(24, 3), (32, 2), (32, 4)])
+def test_samples_of_an_environment_average_its_larger_image(size, samples):
+    """And so at every step; the picture for people is not averaged."""
+    settings = {"renderer": "raster", "render_size": 64, "render_mode": "rgb_array"}
+    small = make_env("move_box", image_size=size, samples=samples, **settings)
+    larger = make_env("move_box", image_size=size * samples, **settings)
+    assert small.observation_space["image"].shape == (size, size, 3)
+    seen = [[env.reset(seed=0)[0]["image"]] for env in (small, larger)]
+    for images, env in zip(seen, (small, larger), strict=True):
+        images.append(env.step(np.full(9, 0.5, np.float32))[0]["image"])
+    for image, whole in zip(*seen, strict=True):
+        np.testing.assert_allclose(image, box_average(whole, samples), atol=1)
+    np.testing.assert_array_equal(small.render(), larger.render())
+    for env in (small, larger):
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"samples": 0}, "samples is 0: give a whole number, at least 1 and at most 4"),
+        ({"samples": 5}, "samples is 5: .* at most 4"),
+        ({"samples": 2.0}, "samples is 2.0: give a whole number"),
+        ({"samples": True}, "samples is True: give a whole number"),
+        ({"samples": 2, "size": 1025}, "samples is 2 at 1025 pixels, .* at most 2048"),
+        ({"size": 0}, "size is 0: .* at least 1"),
+        ({"size": 2049}, "size is 2049: .* at most 2048"),
+        ({"size": 8.5}, "size is 8.5: give a whole number"),
+    ],
+)
+def test_sizes_and_samples_out_of_range_are_refused(every_geom, settings, message):
+    with pytest.raises(MerlError, match=message) as error:
+        RasterRenderer(every_geom, "view", **{"size": 32, **settings})
+    assert "\n" not in str(error.value)
 
 
 def test_depth_of_a_task_is_exact(task):

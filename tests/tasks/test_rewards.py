@@ -96,32 +96,6 @@ def test_staged_floating_follows_the_height_of_the_target() -> None:
 
 
 @pytest.mark.parametrize(
-    ("distance", "share"), [(0.0, 1.0), (0.01, 1.0), (0.16, 0.5), (0.31, 0.0), (0.5, 0.0)]
-)
-def test_far_goal_term_is_a_straight_line(distance: float, share: float) -> None:
-    moved = rewards.move(NEAR, distance, form="far")
-    assert moved["pushing"] == pytest.approx(share / 2, abs=1e-6)
-    assert rewards.move(FAR, distance, form="far")["pushing"] == 0.0
-    lifted = rewards.lift(NEAR, 1.0, 0.0351, 0.18, distance, form="far")
-    assert lifted["lifting"] == pytest.approx(share / 4, abs=1e-6)
-    assert rewards.lift(NEAR, 1.0, 0.035, 0.18, distance, form="far")["lifting"] == 0.0
-
-
-@pytest.mark.parametrize(
-    ("distance", "share"), [(0.01, 1.0), (0.035, 1 / (1 + 9 * 0.25)), (0.06, 0.1)]
-)
-def test_near_goal_term_is_full_within_one_centimetre(distance: float, share: float) -> None:
-    assert rewards.move(NEAR, distance, form="near")["pushing"] == pytest.approx(share / 2)
-
-
-@pytest.mark.parametrize("distance", [0.0, 0.01, 0.03, 0.06, 0.2, 0.5])
-def test_both_is_the_mean_of_near_and_far(distance: float) -> None:
-    forms: tuple[rewards.RewardForm, ...] = ("near", "far", "both")
-    near, far, both = (rewards.move(NEAR, distance, form=form)["pushing"] for form in forms)
-    assert both == pytest.approx((near + far) / 2)
-
-
-@pytest.mark.parametrize(
     ("hand", "cosine", "height", "goal", "expected"),
     [
         # reaching, vertical, floating, lifting; each a quarter, the target at 0.18

@@ -16,15 +16,41 @@ from merl.envs.config import EnvConfig
 from merl.training.config import TrainConfig
 from merl.training.environment import make_run_env, run_spaces
 from merl.training.plain import from_plain, to_plain
+from merl.training.resuming import taken_up
 from toy import DotEnv
 
-WARP = EnvConfig(renderer="warp", image_size=32)
+SMALL = EnvConfig(renderer="raster", image_size=32)
 
 
 def test_recorded_config_names_the_renderer_that_draws() -> None:
     plain = to_plain(TrainConfig("reach_duplo", env=EnvConfig()))["env"]
-    assert plain["renderer"] == "warp"
-    assert from_plain(EnvConfig, plain | {"renderer": "auto"}).renderer == "warp"
+    assert plain["renderer"] == "raster"
+    assert from_plain(EnvConfig, plain | {"renderer": "auto"}).renderer == "raster"
+
+
+def test_samples_are_recorded_and_older_records_have_one() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    plain = to_plain(TrainConfig("reach_duplo", env=env))["env"]
+    assert plain["samples"] == 3
+    assert from_plain(EnvConfig, plain) == env
+    del plain["samples"]
+    assert from_plain(EnvConfig, plain) == dataclasses.replace(env, samples=1)
+
+
+def test_resume_refuses_other_samples() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    recorded = TrainConfig("reach_duplo", env=env)
+    other = dataclasses.replace(recorded, env=dataclasses.replace(env, samples=2))
+    with pytest.raises(MerlError, match=r"cannot go on with env.samples 3 -> 2"):
+        taken_up(recorded, other)
+
+
+def test_samples_reach_the_environment_of_a_run() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    made = make_run_env(TrainConfig("reach_duplo", env=env))
+    assert made.reset(seed=0)[0]["image"].shape == (24, 24, 3)
+    assert made.unwrapped.config.samples == 3  # type: ignore[attr-defined]
+    made.close()
 
 
 @pytest.mark.parametrize(
@@ -39,7 +65,7 @@ def test_recorded_config_names_the_renderer_that_draws() -> None:
     ],
 )
 def test_it_gives_what_its_agent_senses(agent: str, keys: set[str]) -> None:
-    config = TrainConfig("reach_duplo", agent_name=agent, agent=AGENTS[agent], env=WARP)
+    config = TrainConfig("reach_duplo", agent_name=agent, agent=AGENTS[agent], env=SMALL)
     env = make_run_env(config)
     space, _ = run_spaces(config, env)
     assert set(space) == set(env.observation_space) == keys  # type: ignore[call-overload]
@@ -52,7 +78,7 @@ def test_it_gives_what_its_agent_senses(agent: str, keys: set[str]) -> None:
 
 def test_what_the_critic_is_told_is_there_too() -> None:
     agent = dataclasses.replace(AGENTS["merl"], critic_vectors=("state",))
-    env = make_run_env(TrainConfig("reach_duplo", agent=agent, env=WARP))
+    env = make_run_env(TrainConfig("reach_duplo", agent=agent, env=SMALL))
     assert set(env.reset(seed=0)[0]) == {"image", "proprio", "state"}
     env.close()
 
@@ -83,7 +109,7 @@ def test_the_dot_is_narrowed_as_well() -> None:
 def test_what_does_not_fit_is_named(change: dict, says: str) -> None:  # type: ignore[type-arg]
     agent = dataclasses.replace(AGENTS["merl"], **change)
     with pytest.raises(MerlError, match=says):
-        make_run_env(TrainConfig("reach_duplo", agent=agent, env=WARP))
+        make_run_env(TrainConfig("reach_duplo", agent=agent, env=SMALL))
 
 
 class Greedy(DotEnv):

@@ -14,22 +14,20 @@ import numpy as np
 from rich.table import Table
 
 from merl.bench.measuring import circumstances, seconds, shown, spread
-from merl.core import MerlError, counted
+from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.jaco_env import JacoEnv
 from merl.envs.rendering import check_renderer, make_renderer
-from merl.resources import allow_picture_threads, picture_threads
 from merl.tasks.jaco import CAMERA
 
-OURS, ONE, BARE, BLIND, THEIRS = (
-    "merl, warp",
-    "merl, warp, one thread",
-    "physics and picture alone, one thread",
-    "merl, no picture",
+OURS, BARE, BLIND, THEIRS = (
+    "merl, raster",
+    "physics and image alone",
+    "merl, no image",
     "dm_control, OpenGL",
 )
 BAR, GOAL = 15.0, 25.0
-"""How many times as fast as dm_control's an environment step with `warp` is to be."""
+"""How many times as fast as dm_control's an environment step with `raster` is to be."""
 LEAST_RATE, MOST_OVERHEAD = 150.0, 0.1
 """Steps a second on one core; what our code may add to physics and picture, as a share of them."""
 
@@ -47,14 +45,13 @@ def run(repeats: int = 5, steps: int = 60, image_size: int = 84) -> dict[str, An
     Returns:
         Plain values: `steps_per_s` and `reset_ms` by side, `overhead` (what our code adds to
         physics and picture, as a share of them) and `ratio` (ours to dm_control's steps/s), each as
-        `median`, `low` and `high` over the rounds; `picture_threads`; `opengl`, which library drew
-        dm_control's pictures; or `skipped`, why that side is missing.
+        `median`, `low` and `high` over the rounds; `opengl`, which library drew dm_control's
+        pictures; or `skipped`, why that side is missing.
     """
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "image_size": image_size}
-    result |= circumstances() | {"picture_threads": picture_threads()}
+    result |= circumstances()
     sides = {
         OURS: _ours(image_size=image_size),
-        ONE: _ours(image_size=image_size),
         BARE: _bare(image_size),
         BLIND: _ours(observations=("proprio",)),
     }
@@ -67,17 +64,15 @@ def run(repeats: int = 5, steps: int = 60, image_size: int = 84) -> dict[str, An
     try:
         for _ in range(repeats):
             for side, (reset, step, _) in sides.items():
-                allow_picture_threads(result["picture_threads"] if side == OURS else 1)
                 resets[side].append(1e3 * seconds(reset))
                 count = max(1, steps // 6) if side == THEIRS else steps
                 rates[side].append(count / seconds(step, count))
     finally:
-        allow_picture_threads(None)
         for _, _, close in sides.values():
             close()
     result["steps_per_s"] = {side: spread(values) for side, values in rates.items()}
     result["reset_ms"] = {side: spread(values) for side, values in resets.items()}
-    pairs = zip(rates[BARE], rates[ONE], strict=True)
+    pairs = zip(rates[BARE], rates[OURS], strict=True)
     result["overhead"] = spread([bare / ours - 1 for bare, ours in pairs])
     if THEIRS in sides:
         pairs = zip(rates[OURS], rates[THEIRS], strict=True)
@@ -96,7 +91,6 @@ def table(result: dict[str, Any]) -> Table:
     for side, rate in result["steps_per_s"].items():
         rows.add_row(side, shown(rate), shown(result["reset_ms"][side]))
     notes = [
-        f"{OURS}: a picture by {counted(result['picture_threads'], 'thread')}",
         f"the bar of one is {LEAST_RATE:g} steps/s",
         f"our code adds {shown(result['overhead'])} of physics and picture, of which it may add "
         f"{MOST_OVERHEAD:g}",
@@ -113,7 +107,7 @@ def table(result: dict[str, Any]) -> Table:
 
 
 def _ours(**config: Any) -> tuple[Step, Step, Step]:
-    env = make_env("reach_duplo", renderer="warp", **config)
+    env = make_env("reach_duplo", renderer="raster", **config)
     noise = np.random.default_rng(0)
     env.reset(seed=0)  # compiles
     return (
@@ -129,7 +123,7 @@ def _bare(size: int) -> tuple[Step, Step, Step]:
     assert isinstance(env, JacoEnv)
     env.reset(seed=0)
     physics, noise = env.physics, np.random.default_rng(0)
-    renderer = make_renderer("warp", physics, CAMERA.name, size)
+    renderer = make_renderer("raster", physics, CAMERA.name, size)
     mj_step = import_module("mujoco").mj_step
     model, data = physics.model.ptr, physics.data.ptr
     count = env.task.physics_steps_per_control_step

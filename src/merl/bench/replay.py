@@ -129,7 +129,7 @@ def _check_room(folder: Path, space: spaces.Dict, actions: spaces.Box, steps: in
 
 def _pictures() -> tuple[spaces.Dict, spaces.Box, list[dict[str, Any]]]:
     """The spaces, and observations of some episodes."""
-    env = make_env("reach_duplo", renderer="warp")
+    env = make_env("reach_duplo", renderer="raster")
     space, actions = env.observation_space, env.action_space
     assert isinstance(space, spaces.Dict)
     assert isinstance(actions, spaces.Box)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +16,6 @@ from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
 from merl.report.references import references
-from merl.resources import allow_picture_threads
 from merl.training.console import describe
 from merl.training.evaluation import EVALUATION_SEED, load_policy
 from merl.training.evaluation import evaluate as evaluate_policy
@@ -67,8 +65,6 @@ def evaluate(args: list[str]) -> int:
     file, film = _absolute(options.json), _absolute(options.video)
     console = make_console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
-    # Actions take one thread (`load_policy`), pictures as many as in training.
-    allow_picture_threads(min(policy.config.threads or 1, len(os.sched_getaffinity(0))))
     changes: dict[str, Any] = {} if options.renderer is None else {"renderer": options.renderer}
     if options.video is not None:
         size = max(policy.config.env.render_size, MIN_SIDE)

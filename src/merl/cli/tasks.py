@@ -88,7 +88,7 @@ def _to_paste(name: str) -> list[str]:
 
 
 def _picture(name: str) -> NDArray[np.uint8]:
-    env = make_env(name, renderer="warp", image_size=PICTURE_SIZE, observations=("image",))
+    env = make_env(name, renderer="raster", image_size=PICTURE_SIZE, observations=("image",))
     try:
         image: NDArray[np.uint8] = env.reset(seed=START)[0]["image"]
         return image

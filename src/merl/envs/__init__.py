@@ -45,6 +45,5 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
         occluded=settings.occluded,
         starts=settings.start,
         reward=settings.reward,
-        floor=settings.floor,
     )
     return JacoEnv(scene, settings, render_mode)

@@ -7,20 +7,28 @@ from typing import Literal, get_args
 
 from merl.core import MerlError, check_choice
 
-RendererName = Literal["gl", "raster", "warp"]
-RendererChoice = Literal["auto", "gl", "raster", "warp"]
-AUTO_RENDERER: RendererName = "warp"
-"""The renderer that `auto` stands for: the only one that works on every machine, and the faster one
+RendererName = Literal["gl", "raster"]
+RendererChoice = Literal["auto", "gl", "raster"]
+AUTO_RENDERER: RendererName = "raster"
+"""The renderer that `auto` stands for: the one that works on every machine, and the faster one
 where both were measured (docs/bench.md). It does not depend on the machine, so the same code sees
-the same pictures everywhere."""
+the same images everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding"]
-RewardName = Literal["paper", "staged", "near", "far", "both"]
-FloorName = Literal["rough", "smooth"]
+RewardName = Literal["paper", "staged"]
 ImageLayout = Literal["auto", "hwc", "chw"]
 OBSERVATIONS = ("image", "proprio", "state")
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
+MOST_SAMPLES = 4
+REMOVED = {
+    "renderer 'warp'": "renderer raster",
+    "reward 'near'": "reward paper or staged",
+    "reward 'far'": "reward paper or staged",
+    "reward 'both'": "reward paper or staged",
+    "floor 'smooth'": "the rough floor",
+}
+"""Values of earlier versions, which runs may have recorded, and what replaces them."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +36,17 @@ class EnvConfig:
     """How an environment is seen."""
 
     renderer: RendererChoice = "auto"
-    """What draws the pictures: `gl` (OpenGL, as dm_control does), `warp` (a ray tracer that needs
-    no OpenGL and is much faster on a CPU) or `raster` (a z-buffer, seven times as fast as `warp`
-    and nearer to `gl`). To an agent they are different cameras. `auto` is replaced by `warp`."""
+    """What draws the images: `gl` (OpenGL, as dm_control does) or `raster` (a z-buffer that needs
+    no OpenGL and is much faster on a CPU). To an agent they are different cameras. `auto` is
+    replaced by `raster`."""
 
     image_size: int = 84
     """Height and width of the agent's picture, in pixels; from 16 to 2048."""
+
+    samples: int = 1
+    """Samples along each edge of a pixel of the agent's image, 1 to 4, for renderer `raster`; a
+    pixel is their average. An image takes as long as one of `samples` times its size: 24 pixels
+    with 3 samples as long as 72 with 1."""
 
     proprio: ProprioName = "paper"
     """What the robot feels: `paper` (angles and velocities of arm and fingers, 24 numbers) or
@@ -56,26 +69,21 @@ class EnvConfig:
     several, one is drawn in each episode."""
 
     reward: RewardName = "paper"
-    """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5: full within 5 cm of the target),
-    `staged` (the authors' later code: one more term for the last centimetre), or the paper's terms
-    with another goal term: `near` (full within 1 cm, a long tail), `far` (a straight line, to 0 at
-    31 cm), `both` (their mean)."""
-
-    floor: FloorName = "rough"
-    """In `move_box` and `lift_box`: `rough` (dm_control's, a friction of 1) or `smooth` (0.2, for
-    all that touches it: box and fingers slide rather than stick)."""
+    """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5) or `staged` (the authors' later
+    code: one more term for the last centimetre)."""
 
     render_size: int = 480
     """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
 
     def __post_init__(self) -> None:
+        check_not_removed("renderer", self.renderer)
         check_choice("renderer", self.renderer, get_args(RendererChoice))
         if self.renderer == "auto":  # a config, and so a run's record, names what really draws
             object.__setattr__(self, "renderer", AUTO_RENDERER)
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
+        check_not_removed("reward", self.reward)
         check_choice("reward", self.reward, get_args(RewardName))
-        check_choice("floor", self.floor, get_args(FloorName))
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
                 f"observations is {self.observations!r}: give a tuple of at least one of "
@@ -90,13 +98,55 @@ class EnvConfig:
             )
         for name in self.start:
             check_choice("start", name, starts)
-        for field in ("image_size", "render_size"):
-            size = getattr(self, field)
-            if type(size) is not int or not SMALLEST_IMAGE <= size <= LARGEST_IMAGE:
-                raise MerlError(
-                    f"{field} is {size!r}: give a whole number, at least {SMALLEST_IMAGE} and at "
-                    f"most {LARGEST_IMAGE}"
-                )
+        check_whole("image_size", self.image_size, SMALLEST_IMAGE, LARGEST_IMAGE)
+        check_whole("render_size", self.render_size, SMALLEST_IMAGE, LARGEST_IMAGE)
+        check_samples(self.samples, self.image_size)
+        if self.samples != 1 and self.renderer != "raster":
+            raise MerlError(
+                f"samples is {self.samples}, and renderer {self.renderer!r} takes one sample per "
+                "pixel: use renderer raster, or samples 1"
+            )
+
+
+def check_not_removed(name: str, value: str) -> None:
+    """Reject a value that earlier versions of merl had.
+
+    Raises:
+        MerlError: naming the value and the way out.
+    """
+    removed = f"{name} {value!r}"
+    if removed in REMOVED:
+        raise MerlError(
+            f"{removed} no longer exists: train anew with {REMOVED[removed]}, or use the version "
+            "of merl that the run was trained with"
+        )
+
+
+def check_whole(name: str, value: int, least: int, most: int) -> None:
+    """Reject a value that is not a whole number from `least` to `most`.
+
+    Raises:
+        MerlError: naming the value and the bounds.
+    """
+    if type(value) is not int or not least <= value <= most:
+        raise MerlError(
+            f"{name} is {value!r}: give a whole number, at least {least} and at most {most}"
+        )
+
+
+def check_samples(samples: int, size: int) -> None:
+    """Reject samples per pixel edge that are out of range for an image of `size` pixels an edge.
+
+    Raises:
+        MerlError: naming the value and the bounds.
+    """
+    check_whole("samples", samples, 1, MOST_SAMPLES)
+    if samples * size > LARGEST_IMAGE:
+        raise MerlError(
+            f"samples is {samples} at {size} pixels, which is {samples * size} samples along an "
+            f"edge of the image: at most {LARGEST_IMAGE} are possible, so use fewer samples or a "
+            "smaller image"
+        )
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             check_renderer(config.renderer)
         self.task, self.config, self.render_mode = task, config, render_mode
         self._physics: Any = self._compile()
-        self._renderers: dict[int, Renderer] = {}
+        self._renderers: dict[tuple[int, int], Renderer] = {}  # by size and samples
         self._steps_left = 0
         low, high = self._physics.model.actuator_ctrlrange.T
         self._action_center, self._action_scale = (high + low) / 2, (high - low) / 2
@@ -166,7 +166,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         wanted = self.config.observations
         observation: Observation = {}
         if "image" in wanted:
-            observation["image"] = self._picture(self.config.image_size)
+            observation["image"] = self._picture(self.config.image_size, self.config.samples)
         if "proprio" in wanted:
             observation["proprio"] = self.task.proprio(self._physics, self.config.proprio)
         if "state" in wanted:
@@ -180,11 +180,14 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "reward_terms": terms,
         }
 
-    def _picture(self, size: int) -> NDArray[np.uint8]:
-        if size not in self._renderers:
-            renderer = make_renderer(self.config.renderer, self._physics, CAMERA.name, size)
-            self._renderers[size] = renderer
-        return self._renderers[size].render()
+    def _picture(self, size: int, samples: int = 1) -> NDArray[np.uint8]:
+        """An image of the scene, uint8 (size, size, 3)."""
+        if (size, samples) not in self._renderers:
+            renderer = make_renderer(
+                self.config.renderer, self._physics, CAMERA.name, size, samples
+            )
+            self._renderers[size, samples] = renderer
+        return self._renderers[size, samples].render()
 
 
 def _observation_space(config: EnvConfig, state_size: int) -> spaces.Space[Observation]:

@@ -65,8 +65,8 @@ def enable_opengl() -> None:
             _reload_opengl("disabled")
             raise MerlError(
                 f"renderer 'gl' finds no OpenGL that works (tried {name}): install the Debian "
-                "package libegl1, or libosmesa6 and set MUJOCO_GL=osmesa, or use --renderer warp, "
-                "which needs none"
+                "package libegl1, or libosmesa6 and set MUJOCO_GL=osmesa, or use --renderer "
+                "raster, which needs none"
             ) from reason
 
 

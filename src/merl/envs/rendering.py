@@ -1,9 +1,8 @@
-"""Pictures of the scene: three renderers behind one protocol.
+"""Images of the scene: two renderers behind one protocol.
 
-`gl` draws as dm_control does, pixel for pixel. `warp` traces rays on the CPU with mujoco-warp,
-`raster` draws triangles with Warp kernels of merl's own; both need no OpenGL library, draw neither
-sites nor transparency nor reflections, and do not smooth edges (`RasterRenderer` can, on request).
-To an agent they are different cameras.
+`gl` draws as dm_control does, pixel for pixel. `raster` draws triangles with Warp kernels of merl's
+own; it needs no OpenGL library, draws neither sites nor transparency nor reflections, and smooths
+edges only where `samples` is above 1. To an agent they are different cameras.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from merl.envs.config import RendererChoice
 from merl.envs.opengl import GlRenderer, enable_opengl
 from merl.envs.raster.renderer import RasterRenderer
-from merl.envs.ray_tracing import WarpRenderer
 
 
 class Renderer(Protocol):
@@ -33,24 +31,24 @@ class Renderer(Protocol):
         ...
 
 
-def make_renderer(name: RendererChoice, physics: Any, camera: str, size: int) -> Renderer:
+def make_renderer(
+    name: RendererChoice, physics: Any, camera: str, size: int, samples: int = 1
+) -> Renderer:
     """Make a renderer by its name.
 
     Args:
-        name: `gl`, `raster` or `warp`; `EnvConfig` has replaced `auto`.
+        name: `gl` or `raster`; `EnvConfig` has replaced `auto`.
         physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
         camera: the name of a camera in the model.
         size: height and width of the pictures, in pixels.
+        samples: along each edge of a pixel, for `raster`; `EnvConfig` checks it.
 
     Raises:
         MerlError: `gl`, and no OpenGL library works; `raster`, and a geom cannot be drawn.
     """
-    renderers: dict[str, type[Renderer]] = {
-        "gl": GlRenderer,
-        "raster": RasterRenderer,
-        "warp": WarpRenderer,
-    }
-    return renderers[name](physics, camera, size)
+    if name == "raster":
+        return RasterRenderer(physics, camera, size, samples)
+    return GlRenderer(physics, camera, size)
 
 
 def check_renderer(name: RendererChoice) -> None:

@@ -19,15 +19,6 @@ _COMPILER_FLAGS = "-menable-no-nans -fno-signed-zeros -Wno-nan-infinity-disabled
 _warp_lock = threading.RLock()
 
 
-@contextmanager
-def warp_on_cpu() -> Iterator[None]:
-    """Run Warp on the CPU; one thread at a time, for the device is a setting of the process."""
-    import warp
-
-    with _warp_lock, warp.ScopedDevice("cpu"):
-        yield
-
-
 def start_warp() -> Any:
     """Return the module warp, silenced and with a place for its compiled kernels."""
     with _warp_lock:

@@ -81,7 +81,7 @@ def small_config(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) 
         random_steps=1000,
         seed_steps=1000,
         save_every=1e6,
-        env=EnvConfig(renderer="warp"),
+        env=EnvConfig(renderer="raster"),
         replay=ReplayConfig(batch_size=64, frame_stack=1, discount=discount),
         agent=dataclasses.replace(chosen, **values),
         eval=EvaluationConfig(every=steps // evaluations, episodes=20, video="none"),

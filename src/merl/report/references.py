@@ -60,13 +60,12 @@ def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]
 
 
 def form(task: str, env: EnvConfig) -> str:
-    """A task's name and what makes it another task, e.g. "move_box around+holding smooth"."""
+    """A task's name and what makes it another task, e.g. "move_box around+holding staged"."""
     plain = EnvConfig()
     parts = {
         "occluded": "occluded",
         "start": "+".join(env.start),
         "reward": env.reward,
-        "floor": env.floor,
     }
     changed = (told for name, told in parts.items() if getattr(env, name) != getattr(plain, name))
     return " ".join([task, *changed])

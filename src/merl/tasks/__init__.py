@@ -8,7 +8,7 @@ from merl.core import MerlError, meant
 from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
 
 # isort: split
-from merl.tasks.box import ABOVE, BoxTask, Floor, HandStart
+from merl.tasks.box import ABOVE, BoxTask, HandStart
 from merl.tasks.jaco import JacoTask
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
@@ -18,7 +18,6 @@ from merl.tasks.rewards import RewardForm
 __all__ = [
     "BOX_TASKS",
     "TASKS",
-    "Floor",
     "HandStart",
     "JacoTask",
     "LiftBox",
@@ -42,7 +41,6 @@ def make_task(
     occluded: bool = False,
     starts: tuple[HandStart, ...] = ABOVE,
     reward: RewardForm = "paper",
-    floor: Floor = "rough",
 ) -> JacoTask:
     """A task by its name.
 
@@ -51,7 +49,6 @@ def make_task(
         occluded: with a disc between camera and object.
         starts: where the hand starts; of several, one is drawn in each episode.
         reward: which reward, for the tasks with a target.
-        floor: how it lets a box slide.
 
     Raises:
         MerlError: there is no such task, or it has no such form.
@@ -63,7 +60,7 @@ def make_task(
             raise MerlError(
                 "under the disc the hand has no room at the box: occluded needs --start above"
             )
-        return BOX_TASKS[name](occluded=occluded, starts=starts, reward=reward, floor=floor)
+        return BOX_TASKS[name](occluded=occluded, starts=starts, reward=reward)
     if occluded:
         raise MerlError(f"{name} has no occluded form: choose from {', '.join(BOX_TASKS)}")
     if starts != ABOVE:
@@ -74,6 +71,4 @@ def make_task(
         raise MerlError(
             f"{name} has no reward {reward!r}, only 'paper': {', '.join(BOX_TASKS)} have others"
         )
-    if floor != "rough":
-        raise MerlError(f"{name} has a rough floor: only {', '.join(BOX_TASKS)} have another")
     return TASKS[name]()

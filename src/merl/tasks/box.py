@@ -37,11 +37,6 @@ CLOSING_STEPS = 20
 """For so many control steps: enough from the widest start."""
 HandStart = Literal["above", "around", "holding"]
 """Where the hand starts: above the workspace, open around the box, or closed around it."""
-Floor = Literal["rough", "smooth"]
-"""How it lets a box slide: with a friction of 1, that of box and fingers, which MuJoCo takes where
-two differ, or with `SMOOTH`."""
-SMOOTH = (0.2, 0.005, 0.0001)
-"""Friction of the smooth floor: sliding, torsional (m) and rolling (m)."""
 ABOVE: tuple[HandStart, ...] = ("above",)
 """dm_control's start, that of every `JacoTask`."""
 _RED = (1.0, 0.0, 0.0, 1.0)
@@ -61,7 +56,6 @@ class BoxTask(JacoTask):
         starts: where the hand starts; of several, one is drawn in each episode. Under the disc
             there is no room for it at the box.
         reward: which reward.
-        floor: how it lets the box slide, and the fingers.
 
     Attributes:
         occluded, reward: as given.
@@ -80,7 +74,6 @@ class BoxTask(JacoTask):
         occluded: bool = False,
         starts: tuple[HandStart, ...] = ABOVE,
         reward: RewardForm = "paper",
-        floor: Floor = "rough",
     ) -> None:
         size = [BOX_HALF_SIZE] * 3
         box = props.Primitive(geom_type="box", size=size, mass=BOX_MASS, rgba=_RED, name="box")
@@ -89,9 +82,6 @@ class BoxTask(JacoTask):
         if reward == "staged":
             self.term_names = (*self.term_names, "success")
         self._furnish()
-        if floor == "smooth":
-            ground = self._arena.mjcf_model.find("geom", "ground")
-            ground.set_attributes(friction=SMOOTH, priority=1)  # whatever touches it
         if occluded:
             _add_disc(self._arena, self.disc_radius)
 

@@ -23,8 +23,6 @@ SUCCESS_DISTANCE = 0.01
 """The task is solved when the object is this near to its target, m (MERL B.1)."""
 SUCCESS_MARGIN = 0.01
 """Margin of the `success` term of the reward `staged`, long tail, m (the authors' later code)."""
-FAR_GOAL_MARGIN = 0.3
-"""Margin of the reward `far`: a straight line, to 0 after this margin, m."""
 VERTICAL_COSINE = 0.99
 """1 - epsilon_vertical: the hand points down when the cosine of its tilt is at least this; below it
 the reward falls off as a gaussian whose margin is the same number."""
@@ -38,14 +36,12 @@ FLOATING_BELOW_TARGET = 0.01
 FLOATING_SLOPE = 2.0
 """... and multiplied by this, so that it is full half-way up."""
 
-RewardForm = Literal["paper", "staged", "near", "far", "both"]
+RewardForm = Literal["paper", "staged"]
 """The reward of the tasks with a target.
 
 - `paper`: Eqs. 4 and 5 with epsilon_pushing = epsilon_lifting = 0.05 as bound and margin.
 - `staged`: the authors' later code. It adds a `success` term (N = 3 and 5); `floating` is steeper
   and paid only while the object is off the floor.
-- `near`, `far`, `both`: Eqs. 4 and 5 with another goal term: bound 0.01 and margin 0.05 with a long
-  tail; bound 0.01 and a straight line to 0.31 m; the mean of the two.
 """
 Terms = dict[str, float]
 
@@ -76,7 +72,7 @@ def move(hand_distance: float, goal_distance: float, *, form: RewardForm = "pape
     at_object = hand_distance < REACHING_DISTANCE
     terms = {
         "reaching": _near(hand_distance),
-        "pushing": _at_goal(goal_distance, form) if at_object else 0.0,
+        "pushing": _at_goal(goal_distance) if at_object else 0.0,
     }
     if form == "staged":
         terms["success"] = _solved(goal_distance) if at_object else 0.0
@@ -123,7 +119,7 @@ def lift(
         "reaching": _near(hand_distance),
         "vertical": _upright(tilt_cosine, vertical_cosine),
         "floating": min(max(raised, 0.0), 1.0) if floats else 0.0,
-        "lifting": _at_goal(goal_distance, form) if off_floor else 0.0,
+        "lifting": _at_goal(goal_distance) if off_floor else 0.0,
     }
     if form == "staged":
         terms["success"] = _solved(goal_distance) if off_floor else 0.0
@@ -140,16 +136,9 @@ def _near(distance: float) -> float:
     return float(tolerance(distance, bounds, margin=REACHING_MARGIN, sigmoid="gaussian"))
 
 
-def _at_goal(distance: float, form: RewardForm) -> float:
-    def tail(bound: float) -> float:
-        return float(tolerance(distance, (0.0, bound), margin=GOAL_MARGIN, sigmoid="long_tail"))
-
-    if form in ("paper", "staged"):
-        return tail(GOAL_DISTANCE)
-    linear = {"sigmoid": "linear", "value_at_margin": 0.0}
-    far = float(tolerance(distance, (0.0, SUCCESS_DISTANCE), margin=FAR_GOAL_MARGIN, **linear))
-    near = tail(SUCCESS_DISTANCE)
-    return {"near": near, "far": far, "both": (near + far) / 2}[form]
+def _at_goal(distance: float) -> float:
+    bounds = (0.0, GOAL_DISTANCE)
+    return float(tolerance(distance, bounds, margin=GOAL_MARGIN, sigmoid="long_tail"))
 
 
 def _solved(distance: float) -> float:

@@ -17,7 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 from merl.core import MerlError
 
-PINS = {"mujoco": "3.17.0", "dm_control": "1.0.50", "mujoco-warp": "3.17.0"}
+PINS = {"mujoco": "3.17.0", "dm_control": "1.0.50"}
 """The versions that work together: with mujoco 4, dm_control 1.0.50 fails in obscure ways."""
 
 

@@ -116,6 +116,7 @@ class Policy:
                 f"{renderer!r} now: these pictures differ, and it may do worse",
                 stacklevel=2,
             )
+            changes.setdefault("samples", 1)  # the trained renderer's alone
         if self._run is not None:
             self._run.load_module(trusted=trust)
         env = make_run_env(self.config, **changes)

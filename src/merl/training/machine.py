@@ -19,7 +19,6 @@ PACKAGES = (
     "gymnasium",
     "dm_control",
     "mujoco",
-    "mujoco-warp",
     "warp-lang",
     "lz4",
 )

@@ -93,6 +93,7 @@ def taken_up(
         for name in {**before, **after}
         if before.get(name) != after.get(name)
         and name not in _NAMES
+        and not (recorded.own_env and name.startswith("env."))  # of merl's own tasks alone
         and name != "minutes"  # those of the stretch that begins
         and (name in given_open or name not in open_fields)
     }

@@ -29,7 +29,9 @@ import merl
 from merl.agents import AGENTS
 from merl.agents.networks import modalities
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
+from merl.envs.config import AUTO_RENDERER, check_not_removed
 from merl.envs.own import imports_code, load_module, module_folder
+from merl.envs.registration import ENV_IDS
 from merl.training import trust
 from merl.training.config import TrainConfig
 from merl.training.machine import commit, machine, package_versions
@@ -144,8 +146,8 @@ class Run:
             number = record["format"]
             if number != FORMAT:
                 raise MerlError(f"it has format {number}, this merl reads {FORMAT}")
-            config = _read_config(record["config"])
             observation_space, _ = _recorded_spaces(record)
+            config = _read_config(_updated(record["config"], observation_space))
             if config.own_env and "user_env" not in record["config"]:
                 config = _naming_its_keys(config, observation_space)
             _last_machine(record)
@@ -311,6 +313,27 @@ def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
     name = plain.get("agent_name", "merl")
     check_choice("agent", name, tuple(AGENTS))
     return from_plain(TrainConfig, plain, agent=type(AGENTS[name]))
+
+
+def _updated(plain: Mapping[str, Any], space: spaces.Dict) -> Mapping[str, Any]:
+    """Rewrite a recorded config without fields and values that merl no longer has.
+
+    The renderer of a run whose agent sees no image of merl's own tasks does not matter.
+
+    Raises:
+        MerlError: the run depends on a value that no longer exists.
+    """
+    env = plain.get("env")
+    if not isinstance(env, dict):
+        return plain
+    env = dict(env)
+    floor = env.pop("floor", "rough")
+    check_not_removed("floor", floor)
+    check_choice("floor", floor, ("rough",))
+    is_drawn = plain["task"] in ENV_IDS and "image" in space.spaces
+    if env.get("renderer") == "warp" and not is_drawn:
+        env["renderer"] = AUTO_RENDERER
+    return {**plain, "env": env}
 
 
 def _naming_its_keys(config: TrainConfig, space: spaces.Dict) -> TrainConfig:

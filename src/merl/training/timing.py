@@ -25,7 +25,6 @@ from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.core import Batch, MerlError, counted, is_image
 from merl.networks.settings import torch_settings
-from merl.resources import allow_picture_threads
 from merl.training.config import TrainConfig
 from merl.training.loop import Update
 from merl.training.updating import Recorded
@@ -181,9 +180,8 @@ def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -
 
 
 def use_threads(count: int) -> None:
-    """Let updates and pictures of this process take so many threads."""
+    """Let updates of this process take `count` threads."""
     torch.set_num_threads(count)
-    allow_picture_threads(count)
 
 
 def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:

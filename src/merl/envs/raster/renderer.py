@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from merl.envs.config import LARGEST_IMAGE, check_samples, check_whole
 from merl.envs.raster.scene import Scene, build_scene
 from merl.envs.warp_runtime import start_warp, told_if_it_takes_long
 
 SHADOW_TEXELS = 1.5
-"""Texels along an edge of a shadow map for each pixel along an edge of the image."""
+"""Texels along an edge of a shadow map for each sample along an edge of the image."""
 INVISIBLE = 1e-3
 """A highlight is left out where its strength falls below this share."""
 
@@ -29,21 +30,24 @@ class RasterRenderer:
         physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
         camera: the name of a camera in the model.
         size: height and width of the images, in pixels.
-        samples: samples along each edge of a pixel; 2 smooths edges and takes half as long again.
+        samples: samples along each edge of a pixel, 1 to 4; a pixel is their average, as if a
+            larger image were averaged over boxes.
         device: Warp's name of the device that draws.
 
     Raises:
-        MerlError: the model has a geom that cannot be drawn.
+        MerlError: the model has a geom that cannot be drawn, or size or samples are out of range.
     """
 
     def __init__(
         self, physics: Any, camera: str, size: int, samples: int = 1, device: str = "cpu"
     ) -> None:
+        check_whole("size", size, 1, LARGEST_IMAGE)
+        check_samples(samples, size)
         self._wp, self._structs = start_warp(), import_module("merl.envs.raster.structs")
         self._model, self._data = physics.model.ptr, physics.data.ptr
         self._camera = self._model.camera(camera).id
         self._samples, self._side, self._device = samples, size * samples, device
-        self._shadow_side = round(SHADOW_TEXELS * size)
+        self._shadow_side = round(SHADOW_TEXELS * self._side)
         self._scene = build_scene(self._model)
         self._planes = np.array([self._scene.drawn[n] for n in self._scene.planes], int)
         self._shadows = [n for n, light in enumerate(self._scene.lights) if light.casts_shadow]
@@ -188,7 +192,7 @@ class RasterRenderer:
             "paint": launch(
                 shading.paint_background,
                 (self._side, self._side),
-                [surfaces, a.views, a.lights, a.pose, a.offset, samples, a.behind, a.shadowed],
+                [surfaces, a.views, a.lights, a.pose, a.offset, a.behind, a.shadowed],
             ),
             "project": launch(
                 covering.project,

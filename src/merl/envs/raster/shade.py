@@ -110,7 +110,6 @@ def paint_background(
     lights: wp.array(dtype=Light),
     rotations: wp.array2d(dtype=wp.mat33),
     offsets: wp.array2d(dtype=wp.vec3),
-    samples: int,
     behind: wp.array(dtype=Background),
     shadowed: wp.array2d(dtype=Shadowed),
 ):
@@ -118,7 +117,7 @@ def paint_background(
     row, column = wp.tid()
     camera = views[0]
     half = 0.5 * float(camera.size)
-    pixel = float(samples) / camera.focal
+    pixel = 1.0 / camera.focal
     x, y = float(column) + 0.5, float(row) + 0.5
     ray = wp.vec3((x - half) / camera.focal, (half - y) / camera.focal, -1.0)
     inverse = float(0.0)
@@ -184,7 +183,6 @@ def color_of_triangle(
     x: float,
     y: float,
     inverse: float,
-    samples: float,
 ) -> wp.vec3:
     camera = views[0]
     corners = surfaces.triangles[t]
@@ -213,7 +211,7 @@ def color_of_triangle(
             + share[1] * surfaces.coordinates[where[1]]
             + share[2] * surfaces.coordinates[where[2]]
         )
-        footprint = surfaces.density[t] * samples / (camera.focal * inverse)
+        footprint = surfaces.density[t] / (camera.focal * inverse)
         texture = sample_texture(
             surfaces.texels, surfaces.levels, material, uv[0], uv[1], footprint
         )
@@ -249,13 +247,12 @@ def shade(
     samples: int,
     colors: wp.array3d(dtype=wp.uint8),
 ):
-    """Colour a row of pixels, each the mean of its samples; a surface is shaded once in a pixel."""
+    """Colour a row of pixels, each the mean of its samples."""
     row = wp.tid()
     side = views[0].size
     for column in range(colors.shape[1]):
         total = wp.vec3(0.0, 0.0, 0.0)
         color = wp.vec3(0.0, 0.0, 0.0)
-        last = int(-3)
         for s in range(samples * samples):
             j = row * samples + s / samples
             k = column * samples + s % samples
@@ -267,25 +264,19 @@ def shade(
                 if behind[i].geom >= 0:
                     for n in range(maps.shape[0]):
                         color += lit_share(maps, n, shadowed[n, i].where) * shadowed[n, i].color
-                last = int(-3)
             else:
-                triangle = int(key & wp.uint64(0xFFFFFFFF)) - 1
-                surface = surfaces.geom_of[triangle]
-                if surface != last:
-                    color = color_of_triangle(
-                        surfaces,
-                        views,
-                        lights,
-                        maps,
-                        projected,
-                        rotations,
-                        triangle,
-                        float(k) + 0.5,
-                        float(j) + 0.5,
-                        inverse,
-                        float(samples),
-                    )
-                    last = surface
+                color = color_of_triangle(
+                    surfaces,
+                    views,
+                    lights,
+                    maps,
+                    projected,
+                    rotations,
+                    int(key & wp.uint64(0xFFFFFFFF)) - 1,
+                    float(k) + 0.5,
+                    float(j) + 0.5,
+                    inverse,
+                )
             for n in range(3):
                 total[n] += wp.clamp(color[n], 0.0, 1.0)
         scale = 255.0 / float(samples * samples)

@@ -6,12 +6,10 @@ from pathlib import Path
 from statistics import mean
 
 import numpy as np
-from measure_references import EASIER
 
-from merl.envs import EnvConfig
 from merl.experiments.small_tasks import SPLIT, optimum, returns_of
 from merl.report.curves import Curve, curve
-from merl.report.figures import learning_curves, reward_terms
+from merl.report.figures import learning_curves
 from merl.report.references import references
 from merl.statistics import bootstrap_interval, wilson_interval
 
@@ -26,7 +24,6 @@ SENSES = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", "p
 def main() -> None:
     """Draw every picture that is made of numbers."""
     laptop()
-    states()
     agents()
     small_tasks()
     for file in sorted(AGENTS.glob("*-evaluation.json")):
@@ -62,52 +59,18 @@ def laptop() -> None:
     )
 
 
-def states() -> None:
-    """What has been learnt from the state, term by term."""
-    runs = {
-        "reach_duplo": "reach_duplo",
-        "move_box": "move_box",
-        "move_box, goal linear to 0.3 m": "move_box-linear30",
-        "move_box, the same, the hand around the box": "move_box-around",
-        "move_box, easier: around or holding, both, smooth": "move_box-easier",
-        "lift_box": "lift_box",
-        "lift_box, goal linear to 0.3 m": "lift_box-linear30",
-        "lift_box, the same, the hand around or holding the box": "lift_box-holding",
-        "lift_box, easier: around or holding, both, smooth": "lift_box-easier",
-    }
-    forms = {
-        "reach_duplo": ("reach_duplo", EnvConfig()),
-        "move_box": ("move_box", EnvConfig()),
-        "lift_box": ("lift_box", EnvConfig()),
-        **{
-            title: (title.partition(",")[0], EnvConfig(**EASIER))
-            for title, name in runs.items()
-            if name.endswith("easier")
-        },
-    }
-    experts = {
-        title: next(row.terms for row in references(*form) if row.name == "scripted expert")
-        for title, form in forms.items()
-    }
-    files = {title: DATA / f"state-{name}-seed0.csv" for title, name in runs.items()}
-    reward_terms(files, IMAGES / "state.png", references=experts)
-
-
 def agents() -> None:
-    """The agents beside each other on each task, by what they sense."""
-    for task in ("reach_duplo", "move_box", "lift_box"):
-        form = EnvConfig() if task == "reach_duplo" else EnvConfig(**EASIER)
-        known = {row.name: row.returns.mean for row in references(task, form)}
-        for preset, names in SENSES.items():
-            runs = {name: seeds(task, name, preset) for name in names}
-            if all(runs.values()):
-                labels = {f"{agent}, matched": files for agent, files in runs.items()}
-                learning_curves(
-                    labels,
-                    IMAGES / f"agents-{task}-{preset}.png",
-                    references=known,
-                    title=f"{task}, preset {preset}",
-                )
+    """The agents beside each other on `reach_duplo`, by what they sense."""
+    task = "reach_duplo"
+    known = {row.name: row.returns.mean for row in references(task)}
+    for preset, names in SENSES.items():
+        runs = {f"{name}, matched": seeds(task, name, preset) for name in names}
+        learning_curves(
+            runs,
+            IMAGES / f"agents-{task}-{preset}.png",
+            references=known,
+            title=f"{task}, preset {preset}",
+        )
 
 
 def seeds(task: str, agent: str, preset: str) -> list[Curve]:
@@ -115,8 +78,6 @@ def seeds(task: str, agent: str, preset: str) -> list[Curve]:
     files = sorted(AGENTS.glob(f"{task}-{agent}-{preset}-matched-s*.csv"))
     if (agent, preset) == ("merl", "laptop"):
         files = sorted(DATA.glob("laptop-seed?.csv"))  # these runs are merl's on reach_duplo
-    elif not files and agent == "merl_state":
-        files = [DATA / f"state-{task}-easier-seed0.csv"]
     whole = [curve(file, "eval/return") for file in files]
     return [Curve(*(part[one.steps <= MOST[preset]] for part in one)) for one in whole]
 

@@ -1,6 +1,6 @@
 """Draw the tasks as both renderers see them: python docs/make_task_pictures.py (needs OpenGL).
 
-Writes docs/images/tasks.png: the same state by `gl` and `warp`, and how much they differ.
+Writes docs/images/tasks.png: the same state by `gl` and `raster`, and how much they differ.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from merl.tasks import BOX_TASKS, TASKS
 
 OUTPUT = Path(__file__).parent / "images" / "tasks.png"
 SEED, SIZE = 3, 240
+RENDERERS: tuple[RendererName, ...] = ("gl", "raster")
 
 
 def picture(task: str, renderer: RendererName, occluded: bool, size: int) -> NDArray[np.uint8]:
@@ -36,15 +37,15 @@ def main() -> None:
     rows = [(task, False) for task in TASKS] + [(task, True) for task in BOX_TASKS]
     figure = Figure(figsize=(3.0 * 3, 3.0 * len(rows)), dpi=80, layout="constrained")
     for (task, occluded), panels in zip(rows, figure.subplots(len(rows), 3), strict=True):
-        gl, warp = (picture(task, name, occluded, SIZE) for name in ("gl", "warp"))
-        difference = np.abs(gl.astype(int) - warp)
-        small = [picture(task, name, occluded, 84).astype(int) for name in ("gl", "warp")]
+        gl, raster = (picture(task, name, occluded, SIZE) for name in RENDERERS)
+        difference = np.abs(gl.astype(int) - raster)
+        small = [picture(task, name, occluded, 84).astype(int) for name in RENDERERS]
         mean = np.abs(small[0] - small[1]).mean()
         name = task + " --occluded" * occluded
         for axes, image, title in zip(
             panels,
-            (gl, warp, np.clip(4 * difference, 0, 255).astype(np.uint8)),
-            (f"{name}: gl", "warp", f"difference x 4 (mean {difference.mean():.1f} of 255)"),
+            (gl, raster, np.clip(4 * difference, 0, 255).astype(np.uint8)),
+            (f"{name}: gl", "raster", f"difference x 4 (mean {difference.mean():.1f} of 255)"),
             strict=True,
         ):
             axes.imshow(image)

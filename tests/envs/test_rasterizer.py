@@ -1,5 +1,10 @@
 """The rasteriser beside OpenGL and MuJoCo's own rays, on the tasks and on every geom type."""
 
+import itertools
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import mujoco
 import numpy as np
 import pytest
@@ -117,6 +122,63 @@ def test_triangles_are_clipped_at_the_near_plane(every_geom):
     np.testing.assert_allclose(renderer.render_depth()[near], depth[near], rtol=1e-3)
 
 
+def opengls(physics, camera, size):
+    """Depth (m) and geom of each pixel, as OpenGL draws them; -1: no geom."""
+    labels = physics.render(size, size, camera_id=camera, segmentation=True)
+    geoms = np.where(labels[..., 1] == mujoco.mjtObj.mjOBJ_GEOM, labels[..., 0], -1)
+    return physics.render(size, size, camera_id=camera, depth=True), geoms
+
+
+def assert_close(depth, theirs, seen):
+    """Nearly everywhere: OpenGL's samples lie elsewhere in a pixel, which counts at edges."""
+    assert (np.abs(depth - theirs)[seen] < 0.05 * theirs[seen]).mean() > 0.95
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("camera", ["view", "inside"])
+def test_every_geom_has_opengls_silhouette_and_depth(every_geom, camera):
+    renderer = RasterRenderer(every_geom, camera, 84)
+    depth, geoms = opengls(every_geom, camera, 84)
+    mine = renderer.render_segmentation()
+    assert (mine == geoms).mean() > 0.98
+    seen = (mine == geoms) & (geoms >= 0)
+    assert seen.mean() > 0.3
+    assert_close(renderer.render_depth(), depth, seen)
+
+
+GEOMS = {
+    "box": 'type="box" size="0.3 0.3 0.3"',
+    "sphere": 'type="sphere" size="0.3"',
+    "capsule": 'type="capsule" size="0.29 0.01"',
+    "cylinder": 'type="cylinder" size="0.3 0.3"',
+    "ellipsoid": 'type="ellipsoid" size="0.4 0.3 0.3"',
+    "mesh": 'type="mesh" mesh="pyramid"',
+    "plane": 'type="plane" size="1 1 1" pos="0 0 0.3"',
+}
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("geom", GEOMS)
+def test_the_near_plane_cuts_every_geom_as_in_opengl(geom):
+    """The camera grazes the geom, nearer to it than the near plane."""
+    physics = dm_mujoco.Physics.from_xml_string(
+        f"""<mujoco><statistic extent="1"/><visual><map znear="0.2"/></visual>
+        <asset><mesh name="pyramid" vertex="-1 -1 0  1 -1 0  1 1 0  -1 1 0  0 0 0.3"/></asset>
+        <worldbody><camera name="view" pos="0.05 -0.3 0.4" xyaxes="1 0 0 0 0.5 0.9"/>
+        <geom {GEOMS[geom]}/></worldbody></mujoco>"""
+    )
+    physics.forward()
+    renderer = RasterRenderer(physics, "view", 64)
+    depth, geoms = opengls(physics, "view", 64)
+    mine = renderer.render_segmentation()
+    assert 0.03 < (geoms >= 0).mean() < 0.97
+    assert depth[geoms >= 0].min() < 0.21  # the near plane lies at 0.2 m
+    assert (mine == geoms).mean() > 0.98
+    seen = (mine == geoms) & (geoms >= 0)
+    assert_close(renderer.render_depth(), depth, seen)
+    physics.free()
+
+
 @pytest.mark.usefixtures("opengl")
 def test_every_geom_has_opengls_colours(every_geom):
     for samples, bar in ((1, 5.0), (2, 4.0)):
@@ -128,13 +190,15 @@ def test_every_geom_has_opengls_colours(every_geom):
 @pytest.mark.usefixtures("opengl")
 def test_tasks_look_as_opengl_draws_them(task):
     drawn = task.render(84, 84, camera_id=CAMERA.name).astype(int)
-    labels = task.render(84, 84, camera_id=CAMERA.name, segmentation=True)
-    geoms = np.where(labels[..., 1] == mujoco.mjtObj.mjOBJ_GEOM, labels[..., 0], -1)
+    depth, geoms = opengls(task, CAMERA.name, 84)
     for samples in (1, 2):
         renderer = RasterRenderer(task, CAMERA.name, 84, samples)
         assert np.abs(renderer.render().astype(int) - drawn).mean() < 4.0
         if samples == 1:
-            assert (renderer.render_segmentation() == geoms).mean() > 0.995
+            same = renderer.render_segmentation() == geoms
+            assert same.mean() > 0.995
+            seen = same & (geoms >= 0)
+            assert_close(renderer.render_depth(), depth, seen)
 
 
 def box_average(image, samples):
@@ -227,14 +291,90 @@ def test_a_moved_camera_and_light_are_seen(every_geom):
     np.testing.assert_array_equal(renderer.render(), before)
 
 
-def test_a_geom_that_cannot_be_drawn_is_named():
-    physics = dm_mujoco.Physics.from_xml_string(
-        """<mujoco><asset><hfield name="hills" nrow="2" ncol="2" size="1 1 1 1"
-        elevation="0 1 1 0"/></asset><worldbody><camera name="view"/>
-        <geom name="ground" type="hfield" hfield="hills"/></worldbody></mujoco>"""
-    )
-    with pytest.raises(MerlError, match="cannot draw geom 'ground' of type hfield"):
+def in_two_threads(work):
+    """What `work(0)` and `work(1)` return, called in two threads at the same time."""
+    together = threading.Barrier(2)
+
+    def begin(index):
+        together.wait()
+        return work(index)
+
+    with ThreadPoolExecutor(2) as threads:
+        return list(threads.map(begin, range(2)))
+
+
+def test_two_threads_with_a_renderer_each_draw_what_one_draws(every_geom):
+    expected = RasterRenderer(every_geom, "view", 48).render()
+
+    def draw(_):
+        renderer = RasterRenderer(every_geom, "view", 48)
+        return [renderer.render() for _ in range(100)]
+
+    for image in itertools.chain(*in_two_threads(draw)):
+        np.testing.assert_array_equal(image, expected)
+
+
+def test_two_threads_with_one_renderer_draw_what_one_draws(every_geom):
+    renderer = RasterRenderer(every_geom, "view", 48)
+    image, depth = renderer.render(), renderer.render_depth()
+    for images in in_two_threads(lambda _: [renderer.render() for _ in range(300)]):
+        for other in images:
+            np.testing.assert_array_equal(other, image)
+    with ThreadPoolExecutor(1) as another:
+        np.testing.assert_array_equal(another.submit(renderer.render_depth).result(), depth)
+
+
+def test_one_thread_at_a_time_compiles(every_geom, monkeypatch):
+    """Warp crashes where several threads compile its kernels at the same time."""
+    alone, record = threading.Lock(), RasterRenderer._record
+
+    def record_alone(renderer):
+        assert alone.acquire(blocking=False), "two threads compile"
+        time.sleep(0.05)  # enough for the other thread to arrive
+        alone.release()
+        return record(renderer)
+
+    monkeypatch.setattr(RasterRenderer, "_record", record_alone)
+    in_two_threads(lambda _: RasterRenderer(every_geom, "view", 16))
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (
+            """<asset><hfield name="hills" nrow="2" ncol="2" size="1 1 1 1" elevation="0 1 1 0"/>
+            </asset><worldbody><camera name="view"/>
+            <geom name="ground" type="hfield" hfield="hills"/></worldbody>""",
+            "cannot draw geom 'ground' of type hfield: use renderer 'gl'",
+        ),
+        (
+            """<extension><plugin plugin="mujoco.sdf.torus"><instance name="ring"/></plugin>
+            </extension><asset><mesh name="ring"><plugin instance="ring"/></mesh></asset>
+            <worldbody><camera name="view"/>
+            <geom type="sdf" mesh="ring"><plugin instance="ring"/></geom></worldbody>""",
+            "cannot draw geom 'number 0' of type sdf: use renderer 'gl'",
+        ),
+        (
+            """<worldbody><camera name="view"/><flexcomp name="cloth" type="grid" count="3 3 1"
+            spacing="0.1 0.1 0.1" dim="2" radius="0.01"/></worldbody>""",
+            "cannot draw the model's 1 flexes and 0 skins: use renderer 'gl'",
+        ),
+        (
+            '<worldbody><camera name="front"/><camera name="side"/></worldbody>',
+            "has no camera 'view': choose from front, side",
+        ),
+        (
+            '<worldbody><camera name="view" projection="orthographic"/></worldbody>',
+            "cannot draw camera 'view', which is orthographic",
+        ),
+    ],
+    ids=["hfield", "sdf", "flex", "no such camera", "orthographic"],
+)
+def test_what_cannot_be_drawn_is_named_in_one_line(model, message):
+    physics = dm_mujoco.Physics.from_xml_string(f"<mujoco>{model}</mujoco>")
+    with pytest.raises(MerlError, match=message) as error:
         RasterRenderer(physics, "view", 32)
+    assert "\n" not in str(error.value)
     physics.free()
 
 

@@ -253,14 +253,14 @@ def test_gl_after_raster_in_one_process(opengl, raster_env):
 
 def test_it_is_said_that_the_renderer_is_compiled(capsys):
     said, shown = "merl: compiling the renderer, once, for 5 to 20 s\n", ""
-    with warp_runtime.told_if_it_takes_long(0.1):
+    with warp_runtime.compiling(0.1):
         while not shown:  # as compiling does, this takes processor time
             shown = capsys.readouterr().err
     assert shown == said
 
 
 def test_on_a_busy_machine_loading_is_not_called_compiling(capsys):
-    with warp_runtime.told_if_it_takes_long(0.2) as watch:
+    with warp_runtime.compiling(0.2) as watch:
         time.sleep(0.5)  # another process has the processor
     watch.join()
     assert capsys.readouterr().err == ""

@@ -42,12 +42,21 @@ def _configure_warp() -> None:
 
 
 @contextmanager
-def told_if_it_takes_long(seconds: float = 2.0) -> Iterator[threading.Thread]:
-    """Say that the renderer is being compiled, if this takes more than `seconds`.
+def compiling(seconds: float = 2.0) -> Iterator[threading.Thread]:
+    """Let one thread at a time compile or load kernels, since Warp crashes where several do.
 
-    They are seconds of processor time: to load what is compiled already takes fewer, also on a busy
-    machine.
+    Says so on stderr if this takes more than `seconds` of processor time: loading what is compiled
+    already takes fewer, also on a busy machine.
+
+    Yields:
+        The thread that says it.
     """
+    with _warp_lock, _told_if_it_takes_long(seconds) as watching:
+        yield watching
+
+
+@contextmanager
+def _told_if_it_takes_long(seconds: float) -> Iterator[threading.Thread]:
     begin, is_over = time.process_time(), threading.Event()
 
     def watch() -> None:

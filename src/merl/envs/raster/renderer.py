@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import asdict
 from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from merl.core import MerlError, meant
 from merl.envs.config import LARGEST_IMAGE, check_samples, check_whole
 from merl.envs.raster.scene import Scene, build_scene
-from merl.envs.warp_runtime import start_warp, told_if_it_takes_long
+from merl.envs.warp_runtime import compiling, start_warp
 
 SHADOW_TEXELS = 1.5
 """Texels along an edge of a shadow map for each sample along an edge of the image."""
@@ -35,7 +38,8 @@ class RasterRenderer:
         device: Warp's name of the device that draws.
 
     Raises:
-        MerlError: the model has a geom that cannot be drawn, or size or samples are out of range.
+        MerlError: the model has a geom that cannot be drawn, or no such camera, or size or samples
+            are out of range.
     """
 
     def __init__(
@@ -45,7 +49,8 @@ class RasterRenderer:
         check_samples(samples, size)
         self._wp, self._structs = start_warp(), import_module("merl.envs.raster.structs")
         self._model, self._data = physics.model.ptr, physics.data.ptr
-        self._camera = self._model.camera(camera).id
+        self._camera = _camera_of(self._model, camera)
+        self._lock = threading.Lock()
         self._samples, self._side, self._device = samples, size * samples, device
         self._shadow_side = round(SHADOW_TEXELS * self._side)
         self._scene = build_scene(self._model)
@@ -54,29 +59,23 @@ class RasterRenderer:
         self._still: tuple[bytes, ...] = ()
         self._allocate(size)
         self._describe_views()
-        with told_if_it_takes_long():
+        with compiling():
             self._commands = self._record()
             self.render()
 
     def render(self) -> NDArray[np.uint8]:
         """See `rendering.Renderer`."""
-        self._draw()
-        self._launch("shade")
-        image: NDArray[np.uint8] = self._arrays.colors.numpy().copy()
+        image: NDArray[np.uint8] = self._drawn("shade", "colors")
         return image
 
     def render_depth(self) -> NDArray[np.float32]:
         """Distance along the camera's axis, (size, size), m; infinite where nothing is hit."""
-        self._draw()
-        self._launch("measure")
-        depth: NDArray[np.float32] = self._arrays.depth.numpy().copy()
+        depth: NDArray[np.float32] = self._drawn("measure", "depth")
         return depth
 
     def render_segmentation(self) -> NDArray[np.int32]:
         """The geom that each pixel shows, (size, size); -1 for the sky."""
-        self._draw()
-        self._launch("measure")
-        geoms: NDArray[np.int32] = self._arrays.geom.numpy().copy()
+        geoms: NDArray[np.int32] = self._drawn("measure", "geom")
         return geoms
 
     def close(self) -> None:
@@ -222,6 +221,14 @@ class RasterRenderer:
             )
         return commands
 
+    def _drawn(self, launch: str, name: str) -> NDArray[Any]:
+        """Draw the scene as it stands; return a copy of one of the arrays that a launch fills."""
+        with self._lock:  # another thread would draw into the same arrays
+            self._draw()
+            self._launch(launch)
+            array: NDArray[Any] = getattr(self._arrays, name).numpy().copy()
+            return array
+
     def _draw(self) -> None:
         """Everything but the colours: poses, background, z-buffer, shadow maps."""
         data = self._data
@@ -269,6 +276,25 @@ class RasterRenderer:
             views["axes"][1 + n] = _axes(lights["direction"][index])
         self._arrays.views.assign(views)
         self._arrays.lights.assign(lights)
+
+
+def _camera_of(model: Any, name: str) -> int:
+    """The index of a model's camera.
+
+    Raises:
+        MerlError: there is no such camera, or its image is not a perspective with equal angles.
+    """
+    index = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name))
+    if index < 0:
+        known = [model.camera(n).name for n in range(model.ncam)]
+        raise MerlError(f"the model has no camera {name!r}: {meant(name, known)}")
+    is_perspective = model.cam_projection[index] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    if not is_perspective or model.cam_sensorsize[index].any():
+        raise MerlError(
+            f"renderer 'raster' cannot draw camera {name!r}, which is orthographic or has a sensor "
+            "size: give it a field of view (fovy) alone, or use renderer 'gl'"
+        )
+    return index
 
 
 def _axes(direction: NDArray[Any]) -> NDArray[Any]:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from merl.core import MerlError
 from merl.envs.raster.shapes import Shape, shape_of
 from merl.envs.raster.textures import Textures, pixels
 
@@ -104,8 +105,13 @@ def build_scene(model: Any) -> Scene:
     """Collect what is to be drawn of a MuJoCo model.
 
     Raises:
-        MerlError: a geom is of a kind that cannot be drawn.
+        MerlError: a geom is of a kind that cannot be drawn, or the model has soft bodies.
     """
+    if model.nflex or model.nskin:
+        raise MerlError(
+            f"renderer 'raster' cannot draw the model's {model.nflex} flexes and {model.nskin} "
+            "skins: use renderer 'gl'"
+        )
     textures, solids = Textures(), _Solids()
     drawn, planes, sizes = list[int](), list[int](), list[Array]()
     materials: list[Material] = []

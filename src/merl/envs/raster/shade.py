@@ -125,7 +125,7 @@ def paint_background(
     for n in range(surfaces.planes.shape[0]):
         g = surfaces.planes[n]
         nearer = plane_inverse(rotations[0, g], offsets[0, g], ray)
-        if nearer > inverse:
+        if nearer > inverse and nearer * camera.near < 1.0:
             inside = int(1)
             size = surfaces.plane_sizes[n]
             local = wp.transpose(rotations[0, g]) * (ray / nearer - offsets[0, g])

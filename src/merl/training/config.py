@@ -90,9 +90,6 @@ class TrainConfig:
     """Processor threads of the update; if not set, one, or all where that is clearly faster."""
     random_steps: int = 2000
     """Steps of uniformly random actions at the start ("exploration steps" in Table 1)."""
-    random_hold: int = 1
-    """Decisions for which each of these random actions is held: an arm that is told something new
-    25 times a second hardly leaves its place."""
     seed_steps: int = 4000
     """Steps before the first update ("seed frames" in Table 1)."""
     updates_per_step: float = 1.0
@@ -133,7 +130,7 @@ class TrainConfig:
                 f"{type(self.agent).__name__}"
             )
         most = {"num_envs": MOST_ENVS}
-        for name in ("steps", "keep", "action_repeat", "num_envs", "random_hold"):
+        for name in ("steps", "keep", "action_repeat", "num_envs"):
             if not 1 <= getattr(self, name) <= most.get(name, MOST_STEPS):
                 raise MerlError(
                     f"{name.replace('_', '-')} must be at least 1 and at most "

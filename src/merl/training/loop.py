@@ -76,7 +76,7 @@ class Randomness:
         words = np.random.SeedSequence(seed).generate_state(5)
         self._seed, self._environment, self.agent = seed, int(words[0]), int(words[1])
         self.actions, self.batches = (np.random.default_rng(int(word)) for word in words[2:4])
-        self._actions, self._device = int(words[2]), int(words[4])
+        self._device = int(words[4])
 
     def environment(self, index: int = 0, restart: int = 0) -> int:
         """Return the seed of an environment's first reset, in [0, 2^31).
@@ -91,12 +91,6 @@ class Randomness:
             words = np.random.SeedSequence((self._seed, index, restart)).generate_state(1)
             seed = int(words[0])
         return seed % 2**31  # many simulators take the seed as a signed 32-bit integer
-
-    def actions_at(self, decision: int, hold: int) -> np.random.Generator:
-        """The generator of the random actions of a decision, which stay the same for `hold`."""
-        if hold == 1:
-            return self.actions
-        return np.random.default_rng((self._actions, decision // hold))
 
     def on_device(self, updates: int) -> int:
         """The seed of what is sampled from a replay on a GPU, from so many updates on."""
@@ -260,9 +254,8 @@ def _actions(
     """Uniformly random at first, then the agent's: (count, A) in [-1, 1]."""
     if progress.step < config.random_steps:
         shape = (stage.count, *stage.environments.action_shape)
-        decision = progress.step // (stage.count * config.action_repeat)
-        drawn = randomness.actions_at(decision, config.random_hold).uniform(-1.0, 1.0, shape)
-        return Fetched(torch.from_numpy(drawn.astype(np.float32)))
+        drawn = randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
+        return Fetched(torch.from_numpy(drawn))
     return Fetched(agent.act(side_by_side(stage.stacks), explore=True).float())
 
 

@@ -31,6 +31,9 @@ class AgentConfig:
     """Vector keys that the critic alone is told, e.g. `state`: what is known in training only."""
     learning_rate: float = 1e-4
     """Adam's step size, for every network."""
+    actor_every: int = 1
+    """The actor learns in every n-th update only (delayed policy updates, TD3); critic, encoders
+    and target learn in all."""
     tau: float = 0.01
     """How far the target network moves towards the critic at each update, in (0, 1]."""
     noise_std: float = 0.2
@@ -100,7 +103,7 @@ class AgentConfig:
         if not self.noise_clip >= 0:
             raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
         least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1, "noise_steps": 1}
-        least |= {"latent_dim": 0, "shift_pad": 0, "vector_encoder_dim": 0}
+        least |= {"actor_every": 1, "latent_dim": 0, "shift_pad": 0, "vector_encoder_dim": 0}
         for name, bound in least.items():
             most = WIDEST if name != "noise_steps" else 10**12
             if not bound <= getattr(self, name) <= most:

@@ -18,8 +18,9 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG, load_optimizer, step_optimizer
+from merl.agents.ddpg import DDPG
 from merl.agents.networks import Networks
+from merl.agents.optimizers import load_optimizer, step_optimizer
 from merl.core import MerlError
 from merl.networks.settings import with_torch_settings
 

@@ -24,6 +24,7 @@ from merl.agents.networks import Networks
 from merl.agents.optimizers import load_optimizer, step_optimizer
 from merl.core import Batch, Copies
 from merl.networks.augmentation import Crop, draw_shifts
+from merl.networks.critic import TwinCritic
 from merl.networks.settings import with_torch_settings
 
 
@@ -171,17 +172,21 @@ class DDPG:
         networks = self.networks
         # Apart: autocast would hand weights that it cast without a gradient to what needs one.
         with self._arithmetic(), torch.no_grad():
-            y = batch.reward + batch.discount * self.next_value(next_encoded, next_noise)  # (B,)
+            reward = self.config.reward_scale * batch.reward
+            y = reward + batch.discount * self.next_value(next_encoded, next_noise)  # (B,)
         with self._arithmetic():
             latent = networks.critic_fusion(encoded)  # (B, d)
-            q1, q2 = networks.critic(latent, batch.action)
-        loss = (q1 - y).square().mean() + (q2 - y).square().mean()
+            first, second = networks.critic(latent, batch.action)
+        loss = networks.critic.returns.loss(first, second, y)
         step_optimizer(self.critic_optimizer, loss, self.critic_parameters)
+        with torch.no_grad():
+            q1, q2 = (networks.critic.returns.value(output) for output in (first, second))
+        unit = self.config.reward_scale  # values are reported in the unit of the rewards
         return {
             "critic_loss": loss.detach(),
-            "q": q1.detach().mean(),
-            "q_gap": (q1 - q2).detach().abs().mean(),
-            "target_q": y.mean(),
+            "q": q1.mean() / unit,
+            "q_gap": (q1 - q2).abs().mean() / unit,
+            "target_q": y.mean() / unit,
             "reward": batch.reward.mean(),
         }
 
@@ -193,7 +198,9 @@ class DDPG:
     def target_q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
         """The lesser of the averaged critic's two values, (B,)."""
         latent = self._target_part("critic_fusion")(encoded)
-        q1, q2 = self._target_part("critic")(latent, action)
+        critic = self._target_part("critic")
+        assert isinstance(critic, TwinCritic)
+        q1, q2 = critic.values(latent, action)
         return torch.minimum(q1, q2)
 
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
@@ -212,7 +219,7 @@ class DDPG:
         with torch.no_grad():
             latent = self.networks.critic_fusion(encoded)
         with frozen(self.networks.critic):
-            q1, q2 = self.networks.critic(latent, action)
+            q1, q2 = self.networks.critic.values(latent, action)
         return torch.minimum(q1, q2)
 
     @torch.no_grad()

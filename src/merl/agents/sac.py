@@ -49,6 +49,11 @@ class SACConfig(AgentConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.critic_loss != "mse":
+            raise MerlError(
+                f"agent.critic-loss {self.critic_loss} needs returns within bounds, which the "
+                "entropy in SAC's returns has not: use mse"
+            )
         if not 0 < self.temperature < math.inf:
             raise MerlError(f"agent.temperature must be above 0, not {self.temperature}")
         if self.target_entropy is not None and not math.isfinite(self.target_entropy):

@@ -66,6 +66,10 @@ class Case:
             tau=c.tau,
             learning_rate=c.learning_rate,
             averaged=(*fusion, "phi_1", "phi_2"),
+            reward_scale=c.reward_scale,
+            bins=c.critic_bins if c.critic_loss == "hl_gauss" else 0,
+            low=c.reward_scale * c.critic_low,
+            high=c.reward_scale * (100.0 if c.critic_high is None else c.critic_high),
         )
 
     def agent(self, seed: int = 0, actions: int = ACTIONS) -> DDPG:

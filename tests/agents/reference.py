@@ -50,6 +50,10 @@ class Spec:
     clip: float = 0.3
     tau: float = 0.01
     learning_rate: float = 1e-4
+    reward_scale: float = 1.0
+    bins: int = 0  # of a critic that learns a histogram (HL-Gauss); 0: the squared error
+    low: float = 0.0  # bounds of the targets, scaled
+    high: float = 100.0
     averaged: tuple[str, ...] = ("phi_1", "phi_2")  # with "psi_critic" in front: DrQ-v2's target
 
 
@@ -218,9 +222,33 @@ def pi(w: Weights, r_mm: Tensor, noise: Tensor, spec: Spec) -> Tensor:
     return clamp_straight_through(tanh(mlp(w, "theta", r_mm, spec)) + epsilon)
 
 
+def output(w: Weights, phi: str, r_mm: Tensor, a: Tensor, spec: Spec) -> Tensor:
+    return mlp(w, phi, torch.cat([r_mm, a], -1), spec)
+
+
 def q(w: Weights, phi: str, r_mm: Tensor, a: Tensor, spec: Spec) -> Tensor:
     """Q_phi(r, a), (B,)."""
-    return mlp(w, phi, torch.cat([r_mm, a], -1), spec).squeeze(-1)
+    out = output(w, phi, r_mm, a, spec)
+    if not spec.bins:
+        return out.squeeze(-1)
+    _, left, right = bins(spec)
+    p = out.exp() / out.exp().sum(-1, keepdim=True)
+    return p @ ((left + right) / 2)
+
+
+def bins(spec: Spec) -> tuple[float, Tensor, Tensor]:
+    """HL-Gauss (Farebrother et al. 2024): width, left and right edges; three beyond each bound."""
+    width = (spec.high - spec.low) / (spec.bins - 6)
+    left = spec.low + width * (torch.arange(spec.bins, dtype=torch.float64) - 3)
+    return width, left, left + width
+
+
+def histogram(y: Tensor, spec: Spec) -> Tensor:
+    """A Gaussian of 0.75 bins about y, clipped to the bounds, integrated over each bin, (B, n)."""
+    width, left, right = bins(spec)
+    gaussian = torch.distributions.Normal(y.clamp(spec.low, spec.high)[:, None], 0.75 * width)
+    inside = gaussian.cdf(right[-1:]) - gaussian.cdf(left[:1])
+    return (gaussian.cdf(right) - gaussian.cdf(left)) / inside
 
 
 # -- equations 1 and 2 ---------------------------------------------------------------------------
@@ -235,12 +263,16 @@ def target(w: Weights, sample: Sample, chance: Chance, spec: Spec) -> Tensor:
     q_next = torch.minimum(
         q(w, "bar_phi_1", r_mm_next, a_next, spec), q(w, "bar_phi_2", r_mm_next, a_next, spec)
     )
-    return sample.r + sample.discount * q_next
+    return spec.reward_scale * sample.r + sample.discount * q_next
 
 
 def critic_loss(w: Weights, r: Modalities, a: Tensor, y: Tensor, spec: Spec) -> Tensor:
     """Equation 1, the sum over k."""
     r_mm = h(w, "psi_critic", r, spec)
+    if spec.bins:
+        logits = [output(w, phi, r_mm, a, spec) for phi in ("phi_1", "phi_2")]
+        log_p = [x - x.exp().sum(-1, keepdim=True).log() for x in logits]
+        return sum(-(histogram(y, spec) * each).sum(-1).mean() for each in log_p)
     errors = [q(w, phi, r_mm, a, spec) - y for phi in ("phi_1", "phi_2")]
     return sum((error**2).mean() for error in errors)
 

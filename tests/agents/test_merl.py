@@ -116,6 +116,7 @@ def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str
         ("head_layers", 0),
         ("conv_channels", 0),
         ("shift_pad", -1),
+        ("actor_every", 0),
     ],
 )
 def test_a_bad_number_is_named(name: str, value: float) -> None:

@@ -141,3 +141,13 @@ def test_the_first_bad_step_is_told_however_late_one_looks() -> None:
         guard.watch({"critic_loss": torch.tensor(1.0), "actor_loss": torch.tensor(NAN)}, 3)
     with pytest.raises(NotFinite, match=r"actor_loss is not finite at step 3$"):
         guard.watch({"critic_loss": torch.tensor(INF), "actor_loss": torch.tensor(1.0)}, 4)
+
+
+def test_updates_may_differ_in_what_they_report() -> None:
+    guard = LossGuard()
+    guard.watch({"critic_loss": torch.tensor(1.0)}, 1)
+    guard.watch({"critic_loss": torch.tensor(1.0), "actor_loss": torch.tensor(2.0)}, 2)
+    with pytest.raises(NotFinite, match=r"learner's critic_loss is not finite at step 3$"):
+        guard.watch({"critic_loss": torch.tensor(NAN)}, 3)
+    with pytest.raises(NotFinite, match=r"learner's critic_loss is not finite at step 3$"):
+        guard.watch({"critic_loss": torch.tensor(NAN), "actor_loss": torch.tensor(NAN)}, 4)

@@ -365,3 +365,12 @@ def test_from_a_batch_that_is_brought_over_the_same_is_learnt(agent: MERLConfig)
     for each in (parts, twin):
         assert each.run()[-1].updates == 40
     assert torch.equal(parts.weights(), twin.weights())
+
+
+def test_a_step_reports_the_metrics_of_all_its_updates() -> None:
+    """With the actor in every second update, one of three updates may be the last without it."""
+    agent = dataclasses.replace(CONFIG.agent, actor_every=2)
+    parts = Parts(dataclasses.replace(MANY, updates_per_step=3.0, agent=agent, steps=24))
+    learning = [moment.learning for moment in parts.run() if moment.learning]
+    assert len(learning) == 4
+    assert all({"critic_loss", "actor_loss"} <= each.keys() for each in learning)

@@ -5,8 +5,19 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
+import torch
 
-from merl.training.meters import Interval
+from merl.training.meters import Averages, Interval
+
+
+def test_a_metric_that_not_every_update_has_is_averaged_over_those_that_have_it() -> None:
+    averages = Averages()
+    averages.add({"critic_loss": torch.tensor(1.0)})
+    averages.add({"critic_loss": torch.tensor(3.0), "actor_loss": torch.tensor(5.0)})
+    averages.add({})
+    assert averages.take() == {"learn/critic_loss": 2.0, "learn/actor_loss": 5.0}
+    averages.add({"critic_loss": torch.tensor(4.0)})
+    assert averages.take() == {"learn/critic_loss": 4.0}
 
 
 @pytest.mark.parametrize(

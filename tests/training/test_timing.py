@@ -141,3 +141,20 @@ def test_where_compiling_works_it_is_timed(monkeypatch: pytest.MonkeyPatch) -> N
     assert set(found.update) == {FP32, compiled}
     assert found.not_compiled is None
     assert compiled.decided(CONFIG.agent).torch_compile == "yes"
+
+
+def test_updates_with_and_without_the_actor_are_timed_in_their_proportion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, made = [0.0], [0]
+
+    class Agent:
+        config, device = MERLConfig(actor_every=3), torch.device("cpu")
+
+        def update(self, batch: object) -> dict[str, torch.Tensor]:
+            made[0] += 1
+            clock[0] += 5.0 if made[0] % 3 == 0 else 2.0
+            return {"critic_loss": torch.tensor(0.0)}
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
+    assert timing._time_update(Agent(), None) == 3.0  # type: ignore[arg-type]

@@ -8,9 +8,11 @@ from typing import Literal, get_args
 
 from merl.core import MerlError, check_choice
 from merl.networks.fusion import Squash
+from merl.networks.returns import HLGauss
 
 Precision = Literal["auto", "fp32", "bf16"]
 Target = Literal["heads", "heads_and_fusion"]
+CriticLoss = Literal["mse", "hl_gauss"]
 FusionOwner = Literal["decoupled", "shared", "shared_by_both"]
 TorchCompile = Literal["auto", "yes", "no"]
 
@@ -31,6 +33,23 @@ class AgentConfig:
     """Vector keys that the critic alone is told, e.g. `state`: what is known in training only."""
     learning_rate: float = 1e-4
     """Adam's step size, for every network."""
+    critic_loss: CriticLoss = "mse"
+    """How the critic learns its target: by the mean squared error, or as a histogram over bins by
+    cross-entropy (hl_gauss; Farebrother et al. 2024)."""
+    critic_bins: int = 101
+    """Bins of that histogram, the three beyond each bound included."""
+    critic_low: float = 0.0
+    """The lowest return that the histogram can hold, in the unit of the rewards. Lower targets
+    count as this one: with rewards below 0 set it."""
+    critic_high: float | None = None
+    """The highest; if not set, 1 / (1 - discount), which no return exceeds as long as rewards lie
+    in [0, 1]. Higher targets count as this one: with rewards above 1 set it."""
+    reward_scale: float = 1.0
+    """Factor of the rewards that the critic learns from; metrics of Q stay in the environment's
+    unit, losses do not."""
+    actor_every: int = 1
+    """The actor learns in every n-th update only (delayed policy updates, TD3); critic, encoders
+    and target learn in all."""
     tau: float = 0.01
     """How far the target network moves towards the critic at each update, in (0, 1]."""
     noise_std: float = 0.2
@@ -82,12 +101,14 @@ class AgentConfig:
     which tries it once on a GPU, for a run that takes long, and keeps it where it is faster."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.learning_rate < math.inf:
-            raise MerlError(f"agent.learning-rate must be above 0, not {self.learning_rate}")
+        for name in ("learning_rate", "reward_scale"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise MerlError(f"agent.{_flag(name)} must be above 0, not {getattr(self, name)}")
         for name, value, choices in (
             ("precision", self.precision, get_args(Precision)),
             ("target", self.target, get_args(Target)),
             ("squash", self.squash, get_args(Squash)),
+            ("critic-loss", self.critic_loss, get_args(CriticLoss)),
             ("fusion", self.fusion, get_args(FusionOwner)),
             ("torch-compile", self.torch_compile, get_args(TorchCompile)),
         ):
@@ -107,7 +128,8 @@ class AgentConfig:
         if not self.noise_clip >= 0:
             raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
         least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1, "noise_steps": 1}
-        least |= {"latent_dim": 0, "shift_pad": 0, "vector_encoder_dim": 0}
+        least["critic_bins"] = HLGauss.FEWEST
+        least |= {"actor_every": 1, "latent_dim": 0, "shift_pad": 0, "vector_encoder_dim": 0}
         for name, bound in least.items():
             most = WIDEST if name != "noise_steps" else 10**12
             if not bound <= getattr(self, name) <= most:
@@ -115,6 +137,7 @@ class AgentConfig:
                     f"agent.{_flag(name)} must be at least {bound} and at most {most}, "
                     f"not {getattr(self, name)}"
                 )
+        self._check_histogram()
         for name in ("fusion", "fusion_norm", "squash"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):
                 raise MerlError(
@@ -125,6 +148,22 @@ class AgentConfig:
             raise MerlError(
                 f"agent.conv-strides {self.conv_strides} must name a stride of at least 1 for each "
                 "convolution"
+            )
+
+    def _check_histogram(self) -> None:
+        for name in ("critic_bins", "critic_low", "critic_high"):
+            value = getattr(self, name)
+            if self.critic_loss == "mse" and value != getattr(AgentConfig, name):
+                raise MerlError(
+                    f"agent.{_flag(name)} {value} is of a histogram, and agent.critic-loss mse "
+                    "has none: leave it out, or use --agent.critic-loss hl_gauss"
+                )
+            if value is not None and not math.isfinite(value):
+                raise MerlError(f"agent.{_flag(name)} must be finite, not {value}")
+        if self.critic_high is not None and not self.critic_low < self.critic_high:
+            raise MerlError(
+                f"agent.critic-high must be above agent.critic-low {self.critic_low}, "
+                f"not {self.critic_high}"
             )
 
     def noise(self, step: int) -> float:

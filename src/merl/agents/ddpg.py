@@ -21,8 +21,10 @@ from torch import Tensor, nn
 
 from merl.agents.config import AgentConfig
 from merl.agents.networks import Networks
+from merl.agents.optimizers import load_optimizer, step_optimizer
 from merl.core import Batch, Copies
 from merl.networks.augmentation import Crop, draw_shifts
+from merl.networks.critic import TwinCritic
 from merl.networks.settings import with_torch_settings
 
 
@@ -71,6 +73,7 @@ class DDPG:
         step: environment steps so far, which the noise may depend on; set by who drives it.
         sigma: the standard deviation of the noise in updates, where it is kept on the device, as a
             CUDA graph must read it; None: as the config has it for `step`.
+        updates: critic updates so far, which decide when the actor learns.
     """
 
     def __init__(
@@ -82,7 +85,7 @@ class DDPG:
         device: torch.device,
         threads: int | None = None,
     ) -> None:
-        self.step = 0
+        self.step = self.updates = 0
         self.sigma: Tensor | None = None
         self.acting_noise: Tensor | None = None
         self.config = config
@@ -137,13 +140,18 @@ class DDPG:
 
     # Learning -------------------------------------------------------------------------------
 
+    @property
+    def actor_is_due(self) -> bool:
+        """Whether the actor learns in the next update: the last one of every `actor_every`."""
+        return (self.updates + 1) % self.config.actor_every == 0
+
     def update(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step on critic, encoders and actor, and one step of the target."""
+        """Draw noise and shifts, then `learn` from the batch."""
         return self.learn(batch.to(self.device), self.draw(len(batch.action)))
 
     @with_torch_settings
     def learn(self, batch: Batch, draws: Draws) -> dict[str, Tensor]:
-        """`update` with its random numbers given: augment and encode, critic, actor, target."""
+        """Augment and encode; then one step of the critic, of the actor if due, of the target."""
         encoders = self.networks.encoders
         encoders.observe(batch.observation)
         with self._arithmetic():
@@ -151,10 +159,12 @@ class DDPG:
             with torch.no_grad():
                 next_encoded = encoders(batch.next_observation, draws.next_shifts)
         metrics = self.update_critic(encoded, next_encoded, batch, draws.next_noise)
-        # The encoders' features of o_t serve again, from before the critic's step and detached.
-        encoded = {key: features.detach() for key, features in encoded.items()}
-        metrics |= self.update_actor(encoded, draws.actor_noise)
+        if self.actor_is_due:
+            # The encoders' features of o_t serve again, from before the critic's step and detached.
+            encoded = {key: features.detach() for key, features in encoded.items()}
+            metrics |= self.update_actor(encoded, draws.actor_noise)
         self.update_target()
+        self.updates += 1
         return metrics
 
     def update_critic(
@@ -168,17 +178,21 @@ class DDPG:
         networks = self.networks
         # Apart: autocast would hand weights that it cast without a gradient to what needs one.
         with self._arithmetic(), torch.no_grad():
-            y = batch.reward + batch.discount * self.next_value(next_encoded, next_noise)  # (B,)
+            reward = self.config.reward_scale * batch.reward
+            y = reward + batch.discount * self.next_value(next_encoded, next_noise)  # (B,)
         with self._arithmetic():
             latent = networks.critic_fusion(encoded)  # (B, d)
-            q1, q2 = networks.critic(latent, batch.action)
-        loss = (q1 - y).square().mean() + (q2 - y).square().mean()
+            first, second = networks.critic(latent, batch.action)
+        loss = networks.critic.returns.loss(first, second, y)
         step_optimizer(self.critic_optimizer, loss, self.critic_parameters)
+        with torch.no_grad():
+            q1, q2 = (networks.critic.returns.value(output) for output in (first, second))
+        unit = self.config.reward_scale  # values are reported in the unit of the rewards
         return {
             "critic_loss": loss.detach(),
-            "q": q1.detach().mean(),
-            "q_gap": (q1 - q2).detach().abs().mean(),
-            "target_q": y.mean(),
+            "q": q1.mean() / unit,
+            "q_gap": (q1 - q2).abs().mean() / unit,
+            "target_q": y.mean() / unit,
             "reward": batch.reward.mean(),
         }
 
@@ -190,7 +204,9 @@ class DDPG:
     def target_q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
         """The lesser of the averaged critic's two values, (B,)."""
         latent = self._target_part("critic_fusion")(encoded)
-        q1, q2 = self._target_part("critic")(latent, action)
+        critic = self._target_part("critic")
+        assert isinstance(critic, TwinCritic)
+        q1, q2 = critic.values(latent, action)
         return torch.minimum(q1, q2)
 
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
@@ -209,7 +225,7 @@ class DDPG:
         with torch.no_grad():
             latent = self.networks.critic_fusion(encoded)
         with frozen(self.networks.critic):
-            q1, q2 = self.networks.critic(latent, action)
+            q1, q2 = self.networks.critic.values(latent, action)
         return torch.minimum(q1, q2)
 
     @torch.no_grad()
@@ -261,6 +277,7 @@ class DDPG:
             "acting": self.acting.get_state(),
             "learning": self.learning.get_state(),
             "acting_noise": self.acting_noise,
+            "updates": self.updates,
         }
 
     @with_torch_settings
@@ -272,6 +289,7 @@ class DDPG:
         self.acting_noise = None if noise is None else noise.to(self.device)
         load_optimizer(self.critic_optimizer, state["critic_optimizer"])
         load_optimizer(self.actor_optimizer, state["actor_optimizer"])
+        self.updates = state.get("updates", 0)  # checkpoints before `actor_every` have none
         for name in ("acting", "learning"):
             generator: torch.Generator = getattr(self, name)
             # A CPU's generator and CUDA's have states of other kinds: on another device than the
@@ -338,15 +356,6 @@ class DDPG:
         return torch.optim.Adam(parameters, lr=rate, fused=True, capturable=on_gpu)
 
 
-def step_optimizer(
-    optimizer: torch.optim.Optimizer, loss: Tensor, parameters: Sequence[Tensor]
-) -> None:
-    """One step of gradient descent on these parameters; other gradients stay as they are."""
-    optimizer.zero_grad()
-    torch.autograd.backward(loss, inputs=parameters)
-    optimizer.step()
-
-
 @contextmanager
 def frozen(module: nn.Module) -> Iterator[None]:
     """No gradient of the module's weights: compiled code would take it, asked for or not."""
@@ -358,22 +367,6 @@ def frozen(module: nn.Module) -> Iterator[None]:
     finally:
         for weight in weights:
             weight.requires_grad_(True)
-
-
-def load_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
-    """Take back Adam's moments, as copies in the memory order of the weights.
-
-    The fused step walks raw memory: moments in another order would meet the wrong weights. Whether
-    it may be part of a CUDA graph is up to the device that it is on, not the one it was saved on.
-    """
-    capturable = [group["capturable"] for group in optimizer.param_groups]
-    optimizer.load_state_dict(dict(saved))
-    for group, own in zip(optimizer.param_groups, capturable, strict=True):
-        group["capturable"] = own
-    for parameter, moments in optimizer.state.items():
-        for name in ("exp_avg", "exp_avg_sq"):
-            moments[name] = torch.empty_like(parameter).copy_(moments[name])
-        moments["step"] = moments["step"].clone()
 
 
 def _clamp_straight_through(action: Tensor) -> Tensor:

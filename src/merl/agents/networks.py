@@ -16,7 +16,10 @@ from merl.networks.fusion import SIMPLEX_GROUP, Concatenation, Fusion
 from merl.networks.heads import Actor, GaussianActor, HeadSize
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
+from merl.networks.returns import HLGauss, Returns, Scalar
 
+DEFAULT_HIGH = 100.0
+"""The highest return of rewards in [0, 1] with a discount of 0.99."""
 LEAST_SHARE = 2
 """Numbers of the fused representation that a modality must have."""
 
@@ -96,10 +99,12 @@ def make_networks(
     if config.fusion == "decoupled":
         actor_fusion = _fusion(config, senses, share)
     size = HeadSize(config.head_layers, config.hidden_dim, config.head_norm)
-    critic = TwinCritic(critic_fusion.latent_dim, action_dim, size)
+    critic = TwinCritic(critic_fusion.latent_dim, action_dim, size, _returns(config))
     policy = actor((actor_fusion or critic_fusion).latent_dim, action_dim, size)
     networks = Networks(encoders, critic_fusion, critic, actor_fusion, policy)
     orthogonal(networks)
+    for head in (critic.q1, critic.q2):
+        critic.returns.start_at_zero(head.output.bias)
     return networks
 
 
@@ -168,6 +173,15 @@ def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
             f"use agent.latent-dim {SIMPLEX_GROUP * len(senses)} or a multiple"
         )
     return share
+
+
+def _returns(config: AgentConfig) -> Returns:
+    """The form of the critic's output, in the unit of the scaled rewards."""
+    if config.critic_loss == "mse":
+        return Scalar()
+    high = DEFAULT_HIGH if config.critic_high is None else config.critic_high
+    scale = config.reward_scale
+    return HLGauss(scale * config.critic_low, scale * high, config.critic_bins)
 
 
 def _fusion(config: AgentConfig, features: Mapping[str, int], share: int) -> Fusion | Concatenation:

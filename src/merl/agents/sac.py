@@ -18,8 +18,9 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG, load_optimizer, step_optimizer
+from merl.agents.ddpg import DDPG
 from merl.agents.networks import Networks
+from merl.agents.optimizers import load_optimizer, step_optimizer
 from merl.core import MerlError
 from merl.networks.settings import with_torch_settings
 
@@ -48,6 +49,11 @@ class SACConfig(AgentConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.critic_loss != "mse":
+            raise MerlError(
+                f"agent.critic-loss {self.critic_loss} needs returns within bounds, which the "
+                "entropy in SAC's returns has not: use mse"
+            )
         if not 0 < self.temperature < math.inf:
             raise MerlError(f"agent.temperature must be above 0, not {self.temperature}")
         if self.target_entropy is not None and not math.isfinite(self.target_entropy):

@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from merl.networks.heads import MLP, HeadSize
 from merl.networks.precision import compute_dtype
+from merl.networks.returns import Returns, Scalar
 
 
 class TwinCritic(nn.Module):
@@ -19,16 +20,21 @@ class TwinCritic(nn.Module):
     Attributes:
         at_once: compute both in the same kernels. A GPU is held up by the number of kernels, a CPU
             by laying the weights beside each other; None: on a GPU.
+        returns: what an output says about the return.
     """
 
     at_once: bool | None = None
 
-    def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
+    def __init__(
+        self, latent_dim: int, action_dim: int, size: HeadSize, returns: Returns | None = None
+    ) -> None:
         super().__init__()
-        self.q1, self.q2 = (MLP(latent_dim + action_dim, 1, size) for _ in range(2))
+        self.returns = returns or Scalar()
+        outputs = self.returns.outputs
+        self.q1, self.q2 = (MLP(latent_dim + action_dim, outputs, size) for _ in range(2))
 
     def forward(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Latent (B, d) and action (B, A) to the two values, (B,) each."""
+        """Latent (B, d) and action (B, A) to an output of each head: (B,), or logits (B, bins)."""
         both = torch.cat([latent, action], dim=-1)
         at_once = both.is_cuda if self.at_once is None else self.at_once
         if at_once:
@@ -36,6 +42,11 @@ class TwinCritic(nn.Module):
         else:
             q1, q2 = self.q1(both), self.q2(both)
         return q1.squeeze(-1), q2.squeeze(-1)
+
+    def values(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Latent (B, d) and action (B, A) to the two values, (B,) each."""
+        q1, q2 = self(latent, action)
+        return self.returns.value(q1), self.returns.value(q2)
 
 
 def twins(first: MLP, second: MLP, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -60,8 +60,8 @@ class LossGuard:
     """
 
     def __init__(self) -> None:
-        self._names: tuple[str, ...] = ()
-        self._first: Tensor | None = None  # per name, the first bad step
+        # The first bad step of each metric, for each set of metrics that updates have.
+        self._first: dict[tuple[str, ...], Tensor] = {}
 
     def watch(self, metrics: Mapping[str, Tensor], step: int) -> None:
         """Take in the metrics of an update at `step`; nothing, if there was none.
@@ -73,8 +73,9 @@ class LossGuard:
             return
         values = torch.stack([value.float() for value in metrics.values()])
         bad = torch.where(values.isfinite(), _NEVER, step)
-        self._names = tuple(metrics)
-        self._first = bad if self._first is None else torch.minimum(self._first, bad)
+        names = tuple(metrics)
+        before = self._first.get(names)
+        self._first[names] = bad if before is None else torch.minimum(before, bad)
         if not values.is_cuda:
             self.check()
 
@@ -84,10 +85,12 @@ class LossGuard:
         Raises:
             NotFinite: naming the metric that was bad first, and the step.
         """
-        if self._first is None:
-            return
-        steps = self._first.tolist()
-        step = min(steps)
+        first = [
+            pair
+            for names, steps in self._first.items()
+            for pair in zip(names, steps.tolist(), strict=True)
+        ]
+        step = min((step for _, step in first), default=_NEVER)
         if step != _NEVER:
-            names = [name for name, first in zip(self._names, steps, strict=True) if first == step]
+            names = dict.fromkeys(name for name, bad in first if bad == step)
             raise NotFinite(f"the learner's {', '.join(names)} is not finite at step {step:,}")

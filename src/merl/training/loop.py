@@ -271,6 +271,6 @@ def _learn(
     due = updates_due(progress.step - config.seed_steps, config.updates_per_step)
     metrics: dict[str, Tensor] = {}
     while progress.updates < due and not is_to_stop():
-        metrics = update()
+        metrics |= update()
         progress.updates += 1
     return metrics

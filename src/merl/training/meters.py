@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 
 from torch import Tensor
@@ -15,18 +16,18 @@ class Averages:
 
     def __init__(self) -> None:
         self._sums: dict[str, Tensor] = {}
-        self._count = 0
+        self._counts: Counter[str] = Counter()
 
     def add(self, metrics: dict[str, Tensor]) -> None:
-        """Take in one update's."""
+        """Add the metrics of one update; not every update has all of them."""
         for name, value in metrics.items():
             self._sums[name] = self._sums[name] + value if name in self._sums else value
-        self._count += bool(metrics)
+        self._counts.update(metrics.keys())
 
     def take(self) -> dict[str, float]:
         """The means, and begin anew."""
-        means = {f"learn/{name}": float(s) / self._count for name, s in self._sums.items()}
-        self._sums, self._count = {}, 0
+        means = {f"learn/{name}": float(s) / self._counts[name] for name, s in self._sums.items()}
+        self._sums, self._counts = {}, Counter()
         return means
 
 

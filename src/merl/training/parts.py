@@ -15,6 +15,7 @@ import torch
 from gymnasium import spaces
 
 from merl.agents import make_agent
+from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
 from merl.core import MerlError, counted
@@ -60,6 +61,7 @@ class Parts:
         self.films = eval_env is not None and eval_env.render_mode == "rgb_array"
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
+        bounded(config.agent, config.replay.discount)  # what is wrong is refused before timing
         check_memory(config, self.space, self.action_space)
         keep_freed_memory()
         # Without evaluations there are no videos whose frames could be timed.
@@ -74,7 +76,7 @@ class Parts:
             config,
             threads=best.threads,
             device=device_name(config.device),
-            agent=best.decided(config.agent),
+            agent=bounded(best.decided(config.agent), config.replay.discount),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
         self.agent: DDPG = make_agent(
@@ -138,6 +140,22 @@ class Parts:
                 if config.own_env:
                     check_instances(env, eval_env)
             yield cls(config, env, eval_env, home)
+
+
+def bounded(agent: AgentConfig, discount: float) -> AgentConfig:
+    """Return a config with the highest return of a categorical critic set.
+
+    Raises:
+        MerlError: the discount gives no bound, or one that is not above the lowest return.
+    """
+    if agent.critic_loss == "mse" or agent.critic_high is not None:
+        return agent
+    if discount == 1.0:
+        raise MerlError(
+            "replay.discount 1 leaves returns without a bound, and agent.critic-loss "
+            f"{agent.critic_loss} needs one: give --agent.critic-high"
+        )
+    return dataclasses.replace(agent, critic_high=1.0 / (1.0 - discount))
 
 
 def choose_device(name: str) -> torch.device:

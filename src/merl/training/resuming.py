@@ -36,6 +36,7 @@ _LEFT_OPEN = {
     "agent.torch_compile": "auto",
     "agent.images": None,
     "agent.vectors": None,
+    "agent.critic_high": None,
 }
 """Values that leave a field open: the machine decides, and what it has decided is recorded."""
 REOPENED = ("threads", "agent.precision", "agent.torch_compile")

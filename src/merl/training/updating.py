@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -95,6 +96,8 @@ def _fastest_update(
 class Recorded:
     """An update without the host: on a GPU recorded as a CUDA graph, from then on a single launch.
 
+    Updates with and without the actor's step are recorded as one graph each.
+
     Args:
         agent: the learner.
         batch: gives what is learnt from, on the agent's device, by the same operations every time.
@@ -102,7 +105,7 @@ class Recorded:
     """
 
     WARM_UP = 3
-    """Updates before it is recorded."""
+    """Updates of a kind before that kind is recorded."""
 
     def __init__(
         self, agent: DDPG, batch: Callable[[], Batch], generators: Sequence[torch.Generator] = ()
@@ -112,31 +115,34 @@ class Recorded:
         self._sigma = agent.sigma = torch.zeros((), device=agent.device)
         self._on_gpu = agent.device.type == "cuda"
         self._aside = torch.cuda.Stream() if self._on_gpu else None  # type: ignore[no-untyped-call]
-        self._graph: torch.cuda.CUDAGraph | None = None
-        self._names: tuple[str, ...] = ()
-        self._values = torch.empty(0)  # by name, where the graph leaves them
-        self._made = 0
+        # By kind of update: with the actor's step, or without.
+        self._graphs: dict[bool, torch.cuda.CUDAGraph] = {}
+        self._names: dict[bool, tuple[str, ...]] = {}
+        self._values: dict[bool, Tensor] = {}  # of the metrics, where the graph leaves them
+        self._made: Counter[bool] = Counter()
 
     def __call__(self) -> dict[str, Tensor]:
         """One update; returns its metrics, scalars on the device."""
         self._sigma.fill_(self._agent.config.noise(self._agent.step))
-        self._made += 1
+        kind, updates = self._agent.actor_is_due, self._agent.updates
+        self._made[kind] += 1
         if not self._on_gpu:
             values = self._learn()
-        elif self._made <= self.WARM_UP:
+        elif self._made[kind] <= self.WARM_UP:
             values = self._learn_aside()
         else:
-            if self._graph is None:
-                self._graph = self._record()
-            self._graph.replay()
-            values = self._values.clone()
-        return dict(zip(self._names, values.unbind(), strict=True))
+            if kind not in self._graphs:
+                self._graphs[kind] = self._record()
+            self._graphs[kind].replay()
+            values = self._values[kind].clone()
+        self._agent.updates = updates + 1  # a graph that is replayed does not count
+        return dict(zip(self._names[kind], values.unbind(), strict=True))
 
     def _learn(self) -> Tensor:
-        batch = self._batch()
-        told = self._agent.learn(batch, self._agent.draw(len(batch.action)))
-        self._names = tuple(told)
-        return torch.stack([value.float() for value in told.values()])
+        batch, kind = self._batch(), self._agent.actor_is_due
+        metrics = self._agent.learn(batch, self._agent.draw(len(batch.action)))
+        self._names[kind] = tuple(metrics)
+        return torch.stack([value.float() for value in metrics.values()])
 
     def _learn_aside(self) -> Tensor:
         """On a stream of its own, as CUDA graphs want their warm-up."""
@@ -155,10 +161,11 @@ class Recorded:
         gc.collect()  # what it would free during the recording could end it
         here = torch.cuda.stream(torch.cuda.current_stream())  # where a failure is to leave us
         failure: Exception | None = None
+        kind = self._agent.actor_is_due
         try:
             with here, torch.cuda.graph(graph, stream=self._aside):
                 try:
-                    self._values = self._learn()
+                    self._values[kind] = self._learn()
                 except Exception as error:
                     failure = error
                     raise

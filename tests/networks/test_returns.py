@@ -1,0 +1,114 @@
+"""The histogram of a target, against SciPy in float64; how values and losses follow from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+
+from merl.agents.config import AgentConfig
+from merl.agents.sac import SACConfig
+from merl.core import MerlError
+from merl.networks.returns import HLGauss
+from merl.training.parts import bounded
+
+TARGETS = [-1e6, -5.0, -2.0, -1.999, 0.0, 0.01, 3.3, 7.0, 7.999, 8.0, 8.001, 50.0, 1e6]
+
+
+def shares(y: float, low: float, high: float, bins: int) -> list[float]:
+    """Of a Gaussian about y in each bin, one bin after the other."""
+    width = (high - low) / (bins - 6)
+    y = min(max(y, low), high)
+    gaussian = scipy.stats.norm(y, 0.75 * width)
+    first = low - 3 * width
+    mass = [
+        gaussian.cdf(first + (i + 1) * width) - gaussian.cdf(first + i * width) for i in range(bins)
+    ]
+    return [share / sum(mass) for share in mass]
+
+
+@pytest.mark.parametrize("bins", [7, 20, 101])
+def test_targets_become_gaussians_also_at_the_bounds_and_beyond(bins: int) -> None:
+    form = HLGauss(-2.0, 8.0, bins)
+    expected = np.array([shares(y, -2.0, 8.0, bins) for y in TARGETS])
+    found = form.double().histogram(torch.tensor(TARGETS, dtype=torch.float64))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    found = form.float().histogram(torch.tensor(TARGETS))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found.sum(-1), 1.0, rtol=1e-5)
+
+
+def test_the_mean_of_a_histogram_is_its_target() -> None:
+    form = HLGauss(0.0, 100.0, 101)
+    y = torch.tensor([0.0, 1e-3, 0.4, 12.3, 99.9, 100.0])
+    logits = form.histogram(y).clamp(min=1e-30).log()
+    torch.testing.assert_close(form.value(logits), y, rtol=1e-4, atol=2e-3)
+    beyond = form.histogram(torch.tensor([-7.0, 130.0])).clamp(min=1e-30).log()
+    torch.testing.assert_close(form.value(beyond), torch.tensor([0.0, 100.0]), rtol=0, atol=2e-3)
+
+
+def test_the_loss_is_least_at_the_histogram_and_pulls_the_value_to_the_target() -> None:
+    form = HLGauss(0.0, 10.0, 31)
+    y = torch.tensor([2.0, 9.0])
+    logits = torch.zeros(2, 31, requires_grad=True)
+    optimizer = torch.optim.Adam([logits], lr=0.1)
+    first = form.loss(logits, logits, y).item()
+    for _ in range(300):
+        optimizer.zero_grad()
+        loss = form.loss(logits, logits, y)
+        loss.backward()
+        optimizer.step()
+    histogram = form.histogram(y)
+    entropy = 2 * -(histogram * histogram.clamp(min=1e-30).log()).sum(-1).mean()
+    assert entropy - 1e-5 < loss.item() < entropy + 0.05 < first
+    torch.testing.assert_close(form.value(logits).detach(), y, rtol=0, atol=0.05)
+
+
+def test_autocast_does_not_round_values() -> None:
+    form = HLGauss(0.0, 100.0, 101)
+    logits = torch.randn(8, 101)
+    with torch.autocast("cpu", torch.bfloat16):
+        value = form.value(logits)
+    assert torch.equal(value, form.value(logits))
+
+
+@pytest.mark.parametrize("low", [-50.0, 0.0, 20.0])
+def test_the_first_values_are_near_zero_or_the_nearer_bound(low: float) -> None:
+    form = HLGauss(low, 100.0, 101)
+    bias = torch.zeros(101)
+    form.start_at_zero(bias)
+    assert form.value(bias).item() == pytest.approx(max(low, 0.0), abs=0.1)
+
+
+def test_the_highest_return_follows_from_the_discount() -> None:
+    config = AgentConfig(critic_loss="hl_gauss")
+    assert bounded(config, 0.95).critic_high == pytest.approx(20.0)
+    assert bounded(AgentConfig(), 0.95).critic_high is None
+    chosen = AgentConfig(critic_loss="hl_gauss", critic_high=7.0)
+    assert bounded(chosen, 1.0).critic_high == 7.0
+    with pytest.raises(MerlError, match=r"discount 1 leaves .* give --agent.critic-high"):
+        bounded(config, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"critic_loss": "huber"}, "agent.critic-loss .*huber"),
+        ({"critic_bins": 6}, "agent.critic-bins must be at least 7"),
+        ({"critic_low": float("nan")}, "agent.critic-low must be finite, not nan"),
+        ({"critic_high": float("inf")}, "agent.critic-high must be finite, not inf"),
+        ({"critic_low": 3.0, "critic_high": 3.0}, "critic-high must be above .* 3.0, not 3.0"),
+        ({"critic_loss": "mse", "critic_bins": 51}, "critic-bins 51 is of a histogram"),
+        ({"reward_scale": 0.0}, "agent.reward-scale must be above 0, not 0.0"),
+        ({"reward_scale": float("inf")}, "agent.reward-scale must be above 0, not inf"),
+    ],
+)
+def test_a_bad_value_is_named(values: dict[str, object], says: str) -> None:
+    with pytest.raises(MerlError, match=says):
+        AgentConfig(**{"critic_loss": "hl_gauss", **values})  # type: ignore[arg-type]
+
+
+def test_sac_refuses_a_histogram() -> None:
+    with pytest.raises(MerlError, match="critic-loss hl_gauss needs returns within bounds"):
+        SACConfig(critic_loss="hl_gauss")

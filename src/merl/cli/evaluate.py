@@ -92,7 +92,7 @@ def evaluate(args: list[str]) -> int:
     pictures = f"{seen} pictures" if seen else ""
     told = f"{options.run} at step {policy.step:,}{pictures}: {describe(result)}"
     console.print(told, highlight=False)
-    beside = references(config.task, config.env)
+    beside = references(config.task, config.evaluated.env)
     if beside:
         console.print(comparison(config.task, result, beside), highlight=False)
     if options.video is not None:

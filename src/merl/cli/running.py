@@ -174,7 +174,7 @@ def _scale(config: TrainConfig) -> dict[str, float]:
     """The returns that the live view shows beside the agent's; none for an unknown environment."""
     return {
         reference.name: reference.returns.mean
-        for reference in references(config.task, config.env)
+        for reference in references(config.task, config.evaluated.env)
         if reference.name in (RANDOM, EXPERT)
     }
 

@@ -31,7 +31,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
     run, trained = outcome.run, outcome.evaluation
     from merl.report.figures import learning_curve  # here, for Matplotlib is slow to import
 
-    beside = references(run.config.task, run.config.env)
+    beside = references(run.config.task, run.config.evaluated.env)
     if trained is not None and not beside and run.config.eval.references:
         with console.status(
             f"what {' and '.join(FLOORS)} are paid, to compare with", spinner="line"
@@ -68,7 +68,7 @@ def floors(
     config: TrainConfig, episodes: int = 20, *, reports_success: bool = False
 ) -> tuple[Reference, ...]:
     """Random actions, and none (the middle of their range), from the evaluation's starts."""
-    env = make_run_env(config)
+    env = make_run_env(config.evaluated)
     rng = np.random.default_rng(0)
     shape = env.action_space.shape
     assert shape is not None

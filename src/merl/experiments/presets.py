@@ -28,12 +28,15 @@ class Preset:
         config: everything but the agent.
         agent: what it changes of an agent's values, whichever agent it is.
         agent_name: who learns, if nobody is named.
+        own_env: what it changes for a user's own environment, which may be a robot: there is one of
+            it, and its steps cost more than updates.
     """
 
     about: str
     config: TrainConfig
     agent: Mapping[str, Any] = field(default_factory=dict)
     agent_name: str = "merl"
+    own_env: Mapping[str, Any] = field(default_factory=dict)
 
 
 PRESETS: dict[str, Preset] = {
@@ -45,18 +48,29 @@ PRESETS: dict[str, Preset] = {
         "made for 2 cores without a GPU: learns in about an hour",  # docs/laptop.md
         TrainConfig(
             _TASK,
-            steps=150_000,
-            random_steps=1000,
-            seed_steps=2000,
-            env=EnvConfig(renderer="raster", image_size=48),
-            replay=ReplayConfig(batch_size=128),
-            eval=EvaluationConfig(every=10_000, episodes=10, video="last"),
+            steps=1_000_000,
+            random_steps=20_000,
+            seed_steps=20_000,
+            updates_per_step=0.25,
+            num_envs=4,
+            synchronous=False,
+            env=EnvConfig(renderer="raster", image_size=24, samples=3),
+            replay=ReplayConfig(batch_size=128, frame_stack=2),
+            eval=EvaluationConfig(every=40_000, episodes=10, video="last"),
         ),
         {
             "learning_rate": 3e-4,
-            "conv_strides": (2, 2, 1, 1),
-            "shift_pad": 2,
-            "hidden_dim": 512,
+            "conv_strides": (2, 2, 1),
+            "shift_pad": 1,
+            "hidden_dim": 256,
+        },
+        own_env={
+            "steps": 150_000,
+            "random_steps": 1000,
+            "seed_steps": 2000,
+            "updates_per_step": 1.0,
+            "num_envs": 1,
+            "synchronous": True,
         },
     ),
     "state": Preset(
@@ -65,14 +79,16 @@ PRESETS: dict[str, Preset] = {
             _TASK,
             steps=500_000,
             threads=1,
-            random_steps=5000,
-            seed_steps=5000,
+            random_steps=20_000,
+            seed_steps=20_000,
+            updates_per_step=0.25,
             env=EnvConfig(renderer="raster", state="relative"),
             replay=ReplayConfig(batch_size=128),
             eval=EvaluationConfig(every=20_000, episodes=20, video="last"),
         ),
         {"hidden_dim": 256, "learning_rate": 3e-4, "standardize": True, "precision": "fp32"},
         "merl_state",
+        own_env={"random_steps": 5000, "seed_steps": 5000, "updates_per_step": 1.0},
     ),
     "smoke": Preset(
         "the whole pipeline in under a minute: shows that it works, learns nothing",
@@ -160,7 +176,9 @@ def compose(
     check_choice("agent", name, tuple(AGENTS))
     check_choice("setting", setting, get_args(Setting))
     config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
-    if not config.own_env:  # a user's environment may be a robot, which nothing moves unasked
+    if config.own_env:
+        config = dataclasses.replace(config, **chosen.own_env)
+    else:  # a user's environment may be a robot, which nothing moves unasked
         evaluation = dataclasses.replace(config.eval, references=True)
         config = dataclasses.replace(config, eval=evaluation)
     values = dict(chosen.agent)

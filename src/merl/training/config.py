@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,7 +12,7 @@ import tyro
 from merl.agents import AGENTS
 from merl.agents.config import AgentConfig
 from merl.core import MerlError, check_choice, counted
-from merl.envs.config import EnvConfig, UserEnvConfig
+from merl.envs.config import EnvConfig, StartName, UserEnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 
@@ -33,6 +33,8 @@ class EvaluationConfig:
     once, as a single device needs it."""
     episodes: int = 10
     """Episodes of each evaluation."""
+    start: tuple[StartName, ...] | None = None
+    """Where the hand starts in evaluations (see `--start`); as in training, if not set."""
     max_episode_steps: int = 2000
     """Steps after which an episode of an evaluation is cut, if it has not ended by itself."""
     video: Literal["each", "last", "none"] = "each"
@@ -146,6 +148,11 @@ class TrainConfig:
             raise MerlError(
                 f"worker-timeout must be above 0 and at most 1e6 seconds, not {self.worker_timeout}"
             )
+        if self.eval.start is not None and self.own_env:
+            raise MerlError(
+                f"eval.start is for merl's own tasks: {self.task} decides where it starts"
+            )
+        _ = self.evaluated  # its values are checked
         if self.threads is not None and self.threads < 1:
             raise MerlError(f"threads must be at least 1, not {self.threads}")
         for name in ("updates_per_step", "save_every"):
@@ -163,6 +170,14 @@ class TrainConfig:
     def own_env(self) -> bool:
         """Whether the environment is the user's own, not one of merl's tasks."""
         return self.task not in ENV_IDS
+
+    @property
+    def evaluated(self) -> TrainConfig:
+        """The same with the environment that evaluations take place in."""
+        if self.eval.start is None:
+            return self
+        env, evaluation = replace(self.env, start=self.eval.start), replace(self.eval, start=None)
+        return replace(self, env=env, eval=evaluation)
 
     @property
     def has_workers(self) -> bool:

@@ -94,7 +94,7 @@ class Policy:
         return result
 
     def make_env(self, *, trust: bool = False, **changes: Any) -> gymnasium.Env[Any, Any]:
-        """Make the environment that the agent was trained in.
+        """Make the environment that the agent was trained in, as its evaluations start it.
 
         Args:
             trust: import the environment that the run names, although you have not trained this
@@ -119,7 +119,7 @@ class Policy:
             changes.setdefault("samples", 1)  # the trained renderer's alone
         if self._run is not None:
             self._run.load_module(trusted=trust)
-        env = make_run_env(self.config, **changes)
+        env = make_run_env(self.config.evaluated, **changes)
         if self._run is not None and self.config.own_env:
             try:
                 self._run.check_environment(*run_spaces(self.config, env), own_bounds(env))

@@ -133,7 +133,7 @@ class Parts:
                 size = max(config.env.render_size, MIN_SIDE)
                 # Whether a user's environment renders takes a reset to find out.
                 mode = None if config.own_env and config.eval.video == "none" else "rgb_array"
-                eval_env = make_run_env(config, render_mode=mode, render_size=size)
+                eval_env = make_run_env(config.evaluated, render_mode=mode, render_size=size)
                 stack.callback(eval_env.close)
                 expected = EnvSpaces.of(config, env)
                 expected.check(EnvSpaces.of(config, eval_env), "the one that is evaluated in")

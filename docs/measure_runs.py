@@ -1,0 +1,227 @@
+"""The runs behind the curves: python docs/measure_runs.py GROUP ... [--seeds 0 1 2] [--jobs 2].
+
+Runs what is missing of the groups named, `--jobs` at a time, each on one thread at the lowest
+priority, and puts its metrics into docs/data/runs/NAME.csv every few minutes and 50 evaluation
+episodes of its end into NAME-evaluation.json. What is done is not run again. SIGTERM or Ctrl-C
+saves the runs; the same command continues them. `--list` names them and what has been done. Run it
+in a clone that nothing else changes: an edit would change the runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / "docs/data/runs"
+RUNS = ROOT / "runs/measured"
+COPY_EVERY = 120.0
+"""Seconds."""
+BOXES = ("move_box", "lift_box")
+STATE_AGENTS = ("merl_state", "ddpg", "sac")
+LAPTOP = "--preset laptop --agent.precision bf16"
+STATE = "--preset state"
+REACH_STEPS, STATE_STEPS, BOX_STEPS = 400_000, 300_000, 1_000_000
+
+
+def figure2() -> Iterator[tuple[str, str]]:
+    """Every agent on reach_duplo with preset laptop."""
+    for agent in ("merl", "drqv2", "proprio", *STATE_AGENTS):
+        noise = f" --agent.noise-steps {REACH_STEPS // 2}" if agent == "drqv2" else ""
+        yield (
+            f"reach_duplo-{agent}",
+            f"reach_duplo {LAPTOP} --agent {agent} --steps {REACH_STEPS}{noise}",
+        )
+
+
+def figures3and5() -> Iterator[tuple[str, str]]:
+    """MERL on reach_duplo with one thing changed; the unchanged one is of figure2."""
+    changes = {
+        "shared": "--agent.fusion shared",
+        "shared-by-both": "--agent.fusion shared_by_both",
+        "d64": "--agent.latent-dim 64",
+        "d256": "--agent.latent-dim 256",
+        "no-norm": "--agent.no-fusion-norm",
+        "scheduled": "--agent.noise-std 1.0 --agent.noise-std-end 0.1 "
+        f"--agent.noise-steps {REACH_STEPS // 2}",
+        "mlp64": "--agent.vector-encoder-dim 64",
+        "mlp128": "--agent.vector-encoder-dim 128",
+        "mlp256": "--agent.vector-encoder-dim 256",
+    }
+    for name, flags in changes.items():
+        yield f"reach_duplo-merl-{name}", f"reach_duplo {LAPTOP} --steps {REACH_STEPS} {flags}"
+
+
+def state() -> Iterator[tuple[str, str]]:
+    """The agents on the state, every task."""
+    for task in ("reach_duplo", *BOXES):
+        for agent in STATE_AGENTS:
+            yield f"{task}-{agent}-state", f"{task} {STATE} --agent {agent} --steps {STATE_STEPS}"
+
+
+def boxes() -> Iterator[tuple[str, str]]:
+    """MERL with six layers from camera and joints on the boxes, as the paper starts them."""
+    for reward in ("staged", "paper"):
+        for task in BOXES:
+            yield (
+                f"{task}-merl-{reward}",
+                f"{task} {LAPTOP} --agent.head-layers 6 --reward {reward} --steps {BOX_STEPS}",
+            )
+
+
+def boxes_state() -> Iterator[tuple[str, str]]:
+    """The agents on the state, likewise, a million steps each."""
+    for task in BOXES:
+        for agent in STATE_AGENTS:
+            layers = " --agent.head-layers 6" if agent == "merl_state" else ""
+            yield (
+                f"{task}-{agent}-staged",
+                f"{task} {STATE} --agent {agent} --reward staged --steps {BOX_STEPS}{layers}",
+            )
+
+
+def boxes_mixed() -> Iterator[tuple[str, str]]:
+    """Training starts mixed over all stages; evaluations start above the box."""
+    for task in BOXES:
+        for agent, preset in (("merl_state", STATE), ("merl", LAPTOP)):
+            yield (
+                f"{task}-{agent}-mixed",
+                f"{task} {preset} --agent {agent} --reward staged --start above around holding "
+                f"--eval.start above --agent.head-layers 6 --steps {BOX_STEPS}",
+            )
+
+
+GROUPS = {
+    "figure2": figure2,
+    "figures3and5": figures3and5,
+    "state": state,
+    "boxes": boxes,
+    "boxes_state": boxes_state,
+    "boxes_mixed": boxes_mixed,
+}
+
+
+class Queue:
+    """Runs that are missing, taken in order; those under way are stopped by `stop`."""
+
+    def __init__(self, runs: list[tuple[str, str]]) -> None:
+        self._runs = [run for run in runs if not evaluation(run[0]).exists()]
+        self._lock = threading.Lock()
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self.stopping = False
+
+    def work(self) -> None:
+        """Run one after the other."""
+        while True:
+            with self._lock:
+                if self.stopping or not self._runs:
+                    return
+                name, arguments = self._runs.pop(0)
+            if self._call(name, "train", *arguments.split(), "--resume"):
+                copy(name)
+                self._call(name, "evaluate", RUNS / name, "--episodes", "50")
+
+    def stop(self) -> None:
+        """Have every run save and end."""
+        self.stopping = True
+        for process in self._processes:
+            process.terminate()
+
+    def _call(self, name: str, command: str, *arguments: object) -> bool:
+        """Run merl at the lowest priority; returns whether it ended well."""
+        RUNS.mkdir(parents=True, exist_ok=True)
+        given = [str(argument) for argument in arguments]
+        if command == "train":
+            given += ["--threads", "1", "--run-dir", str(RUNS / name), "--eval.video", "none"]
+        else:
+            given += ["--json", str(evaluation(name))]
+        with (RUNS / f"{name}.log").open("ab") as log:
+            process = subprocess.Popen(
+                ["nice", "-n", "19", sys.executable, "-m", "merl.cli", command, *given],
+                cwd=ROOT,
+                stdout=log,
+                stderr=log,
+            )
+        with self._lock:
+            self._processes.append(process)
+            if self.stopping:
+                process.terminate()
+        while process.poll() is None:
+            with_patience(process)
+            copy(name)
+        with self._lock:
+            self._processes.remove(process)
+        print(f"{name}: {command} ended with {process.returncode}", flush=True)
+        return process.returncode == 0 and not self.stopping
+
+
+def with_patience(process: subprocess.Popen[bytes]) -> None:
+    """Wait for its end, COPY_EVERY seconds at most."""
+    try:
+        process.wait(COPY_EVERY)
+    except subprocess.TimeoutExpired:
+        return
+
+
+def evaluation(name: str) -> Path:
+    """Where the episodes of a run's end are kept."""
+    return DATA / f"{name}-evaluation.json"
+
+
+def copy(name: str) -> None:
+    """Keep a run's rows."""
+    metrics = RUNS / name / "metrics.csv"
+    if metrics.exists():
+        DATA.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(metrics, DATA / f"{name}.csv")
+
+
+def steps(name: str) -> int:
+    """Steps that a run has logged."""
+    path = DATA / f"{name}.csv"
+    if not path.exists():
+        return 0
+    with path.open() as file:
+        return max((int(row["step"]) for row in csv.DictReader(file)), default=0)
+
+
+def main() -> None:
+    """Run what is missing."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("groups", nargs="*", choices=[*GROUPS, []], help="all, if none is named")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
+    parser.add_argument("--list", action="store_true", help="name the runs, and what is done")
+    asked = parser.parse_args()
+    runs = [
+        (f"{name}-s{seed}", f"{arguments} --seed {seed}")
+        for seed in asked.seeds
+        for group in asked.groups or GROUPS
+        for name, arguments in GROUPS[group]()
+    ]
+    if asked.list:
+        for name, arguments in runs:
+            state = "done" if evaluation(name).exists() else f"{steps(name):,} steps"
+            print(f"{name:40} {state:>16}  merl train {arguments}")
+        return
+    queue = Queue(runs)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: queue.stop())
+    threads = [threading.Thread(target=queue.work) for _ in range(asked.jobs)]
+    for thread in threads:
+        thread.start()
+        time.sleep(1)
+    while any(thread.is_alive() for thread in threads):
+        time.sleep(0.5)  # signals are taken here
+
+
+if __name__ == "__main__":
+    main()

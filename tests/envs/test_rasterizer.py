@@ -1,69 +1,14 @@
 """The rasteriser beside OpenGL and MuJoCo's own rays, on the tasks and on every geom type."""
 
-import itertools
-import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
-
 import mujoco
 import numpy as np
 import pytest
 from dm_control import mujoco as dm_mujoco
 
-from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.raster.renderer import RasterRenderer
-from merl.envs.rendering import check_renderer
 from merl.tasks import TASKS
 from merl.tasks.jaco import CAMERA
-
-EVERY_GEOM = """
-<mujoco>
-  <visual><map znear="0.05"/></visual>
-  <asset>
-    <texture name="sky" type="skybox" builtin="gradient" rgb1="0.3 0.5 0.7" rgb2="0 0 0" width="64"
-      height="64"/>
-    <texture name="checks" type="2d" builtin="checker" rgb1="0.2 0.3 0.4" rgb2="0.6 0.7 0.8"
-      width="64" height="64"/>
-    <material name="checks" texture="checks" texrepeat="2 2" texuniform="true" specular="0"/>
-    <material name="shiny" rgba="0.2 0.6 0.3 1" specular="1" shininess="0.8"/>
-    <material name="glowing" rgba="0.8 0.2 0.2 1" emission="0.4"/>
-    <mesh name="pyramid" vertex="-0.2 -0.2 0  0.2 -0.2 0  0.2 0.2 0  -0.2 0.2 0  0 0 0.4"/>
-  </asset>
-  <worldbody>
-    <light pos="0.5 -0.5 2.5" dir="-0.2 0.2 -1" directional="true" diffuse="0.4 0.4 0.4"/>
-    <light pos="-1 -1 2" dir="0.4 0.4 -0.8" cutoff="50" diffuse="0.5 0.5 0.4"/>
-    <camera name="view" pos="0 -2.6 1.3" xyaxes="1 0 0 0 0.42 0.9"/>
-    <camera name="inside" pos="0 -0.9 0.15" xyaxes="1 0 0 0 0.2 1"/>
-    <geom type="plane" size="2 2 0.1" material="checks"/>
-    <geom type="box" pos="-0.9 0 0.2" size="0.2 0.15 0.2" euler="0 0 30" rgba="0.7 0.2 0.1 1"/>
-    <geom type="sphere" pos="-0.45 0 0.2" size="0.2" material="shiny"/>
-    <geom type="capsule" pos="0 0 0.35" size="0.1 0.2" euler="20 0 0" rgba="0.2 0.2 0.7 1"/>
-    <geom type="cylinder" pos="0.4 0 0.2" size="0.15 0.2" euler="0 20 0" rgba="0.7 0.7 0.1 1"/>
-    <geom type="ellipsoid" pos="0.8 0 0.2" size="0.2 0.1 0.2" material="glowing"/>
-    <geom type="mesh" mesh="pyramid" pos="0 0.6 0" rgba="0.5 0.1 0.6 1"/>
-    <geom type="box" pos="0 -0.7 0.02" size="1 0.4 0.02" rgba="0.4 0.5 0.4 1"/>
-    <geom type="box" pos="0 1 0.5" size="0.3 0.1 0.5" rgba="1 1 1 0"/>
-    <geom type="sphere" pos="0 -1 0.5" size="0.3" group="3"/>
-  </worldbody>
-</mujoco>
-"""
-
-
-@pytest.fixture(scope="module")
-def opengl():
-    try:
-        check_renderer("gl")
-    except MerlError:
-        pytest.skip("no OpenGL library works on this machine")
-
-
-@pytest.fixture(scope="module")
-def every_geom():
-    physics = dm_mujoco.Physics.from_xml_string(EVERY_GEOM)
-    physics.forward()
-    yield physics
-    physics.free()
 
 
 @pytest.fixture(params=TASKS)
@@ -232,25 +177,6 @@ def test_samples_of_an_environment_average_its_larger_image(size, samples):
         env.close()
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"samples": 0}, "samples is 0: give a whole number, at least 1 and at most 4"),
-        ({"samples": 5}, "samples is 5: .* at most 4"),
-        ({"samples": 2.0}, "samples is 2.0: give a whole number"),
-        ({"samples": True}, "samples is True: give a whole number"),
-        ({"samples": 2, "size": 1025}, "samples is 2 at 1025 pixels, .* at most 2048"),
-        ({"size": 0}, "size is 0: .* at least 1"),
-        ({"size": 2049}, "size is 2049: .* at most 2048"),
-        ({"size": 8.5}, "size is 8.5: give a whole number"),
-    ],
-)
-def test_sizes_and_samples_out_of_range_are_refused(every_geom, settings, message):
-    with pytest.raises(MerlError, match=message) as error:
-        RasterRenderer(every_geom, "view", **{"size": 32, **settings})
-    assert "\n" not in str(error.value)
-
-
 def test_depth_of_a_task_is_exact(task):
     renderer = RasterRenderer(task, CAMERA.name, 32)
     depth, geom = rays(task, CAMERA.name, 32)
@@ -289,110 +215,3 @@ def test_a_moved_camera_and_light_are_seen(every_geom):
     np.testing.assert_array_equal(relit, RasterRenderer(every_geom, "view", 48).render())
     data.light_xdir[:] = kept[1]
     np.testing.assert_array_equal(renderer.render(), before)
-
-
-def in_two_threads(work):
-    """What `work(0)` and `work(1)` return, called in two threads at the same time."""
-    together = threading.Barrier(2)
-
-    def begin(index):
-        together.wait()
-        return work(index)
-
-    with ThreadPoolExecutor(2) as threads:
-        return list(threads.map(begin, range(2)))
-
-
-def test_two_threads_with_a_renderer_each_draw_what_one_draws(every_geom):
-    expected = RasterRenderer(every_geom, "view", 48).render()
-
-    def draw(_):
-        renderer = RasterRenderer(every_geom, "view", 48)
-        return [renderer.render() for _ in range(100)]
-
-    for image in itertools.chain(*in_two_threads(draw)):
-        np.testing.assert_array_equal(image, expected)
-
-
-def test_two_threads_with_one_renderer_draw_what_one_draws(every_geom):
-    renderer = RasterRenderer(every_geom, "view", 48)
-    image, depth = renderer.render(), renderer.render_depth()
-    for images in in_two_threads(lambda _: [renderer.render() for _ in range(300)]):
-        for other in images:
-            np.testing.assert_array_equal(other, image)
-    with ThreadPoolExecutor(1) as another:
-        np.testing.assert_array_equal(another.submit(renderer.render_depth).result(), depth)
-
-
-def test_one_thread_at_a_time_compiles(every_geom, monkeypatch):
-    """Warp crashes where several threads compile its kernels at the same time."""
-    alone, record = threading.Lock(), RasterRenderer._record
-
-    def record_alone(renderer):
-        assert alone.acquire(blocking=False), "two threads compile"
-        time.sleep(0.05)  # enough for the other thread to arrive
-        alone.release()
-        return record(renderer)
-
-    monkeypatch.setattr(RasterRenderer, "_record", record_alone)
-    in_two_threads(lambda _: RasterRenderer(every_geom, "view", 16))
-
-
-@pytest.mark.parametrize(
-    ("model", "message"),
-    [
-        (
-            """<asset><hfield name="hills" nrow="2" ncol="2" size="1 1 1 1" elevation="0 1 1 0"/>
-            </asset><worldbody><camera name="view"/>
-            <geom name="ground" type="hfield" hfield="hills"/></worldbody>""",
-            "cannot draw geom 'ground' of type hfield: use renderer 'gl'",
-        ),
-        (
-            """<extension><plugin plugin="mujoco.sdf.torus"><instance name="ring"/></plugin>
-            </extension><asset><mesh name="ring"><plugin instance="ring"/></mesh></asset>
-            <worldbody><camera name="view"/>
-            <geom type="sdf" mesh="ring"><plugin instance="ring"/></geom></worldbody>""",
-            "cannot draw geom 'number 0' of type sdf: use renderer 'gl'",
-        ),
-        (
-            """<worldbody><camera name="view"/><flexcomp name="cloth" type="grid" count="3 3 1"
-            spacing="0.1 0.1 0.1" dim="2" radius="0.01"/></worldbody>""",
-            "cannot draw the model's 1 flexes and 0 skins: use renderer 'gl'",
-        ),
-        (
-            '<worldbody><camera name="front"/><camera name="side"/></worldbody>',
-            "has no camera 'view': choose from front, side",
-        ),
-        (
-            '<worldbody><camera name="view" projection="orthographic"/></worldbody>',
-            "cannot draw camera 'view', which is orthographic",
-        ),
-    ],
-    ids=["hfield", "sdf", "flex", "no such camera", "orthographic"],
-)
-def test_what_cannot_be_drawn_is_named_in_one_line(model, message):
-    physics = dm_mujoco.Physics.from_xml_string(f"<mujoco>{model}</mujoco>")
-    with pytest.raises(MerlError, match=message) as error:
-        RasterRenderer(physics, "view", 32)
-    assert "\n" not in str(error.value)
-    physics.free()
-
-
-@pytest.mark.parametrize(
-    "body",
-    [
-        "",
-        '<geom type="plane" size="1 1 1"/>',
-        '<geom type="box" size="1 1 1"/><light pos="0 0 3" type="point"/>',
-    ],
-    ids=["nothing", "a plane alone", "no plane"],
-)
-def test_scenes_that_lack_planes_triangles_or_lights_are_drawn(body):
-    physics = dm_mujoco.Physics.from_xml_string(
-        f"""<mujoco><visual><headlight active="0"/></visual><worldbody>
-        <camera name="view" pos="0 0 4"/>{body}</worldbody></mujoco>"""
-    )
-    renderer = RasterRenderer(physics, "view", 16)
-    assert renderer.render().shape == (16, 16, 3)
-    assert (renderer.render_segmentation() >= 0).any() == bool(body)
-    physics.free()

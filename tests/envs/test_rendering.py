@@ -11,19 +11,7 @@ import numpy as np
 import pytest
 from dm_control import manipulation
 
-from merl.core import MerlError
 from merl.envs import make_env, warp_runtime
-from merl.envs.rendering import check_renderer
-
-NO_OPENGL = "no OpenGL library works on this machine"
-
-
-@pytest.fixture(scope="module")
-def opengl():
-    try:
-        check_renderer("gl")
-    except MerlError:
-        pytest.skip(NO_OPENGL)
 
 
 @pytest.fixture(scope="module")

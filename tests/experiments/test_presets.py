@@ -27,6 +27,11 @@ def test_preset_paper_is_table_1() -> None:
     assert (agent.hidden_dim, agent.vector_encoder_dim) == (1024, 0)
 
 
+@pytest.mark.parametrize("preset", [name for name in PRESETS if name != "paper"])
+def test_presets_for_machines_without_opengl_use_raster(preset: str) -> None:
+    assert compose(preset, "reach_duplo").env.renderer == "raster"
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_users_environment_is_not_moved_to_compare_unless_asked(preset: str) -> None:
     assert compose(preset, "move_box").eval.references

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import takewhile
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def test_info_tells_what_each_preset_would_take(capsys: pytest.CaptureFixture[st
     shown = flat(capsys.readouterr().out)
     assert "preset laptop" in shown
     assert "steps/s and" in shown
-    assert "h for 150,000 steps" in shown
+    assert re.search(r"preset laptop about [\d,.]+ steps/s and [\d,.]+ updates/s", shown)
 
 
 def test_bench_env_writes_what_it_shows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

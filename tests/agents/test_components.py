@@ -60,3 +60,27 @@ def test_a_saved_agent_keeps_its_place_between_two_updates_of_the_actor() -> Non
     for each in (agent, resumed):
         train(each, case, range(4, 6))  # the second of these moves the actor
     assert same(agent, resumed)
+
+
+# -- step sizes ----------------------------------------------------------------------------------
+
+
+def test_groups_of_step_sizes_are_restored() -> None:
+    case = Case(
+        "camera",
+        MERLConfig(latent_dim=16, conv_channels=4, encoder_learning_rate=1e-3, **SMALL),
+        images={"image": (16, 16, 1)},
+    )
+    agent, resumed = case.agent(), case.agent(seed=9)
+    train(agent, case, range(2))
+    resumed.load_state_dict(through_a_file(agent.state_dict()))
+    for each in (agent, resumed):
+        train(each, case, range(2, 4))
+    assert same(agent, resumed)
+    rates = [group["lr"] for group in resumed.critic_optimizer.param_groups]
+    assert sorted(rates) == [1e-4, 1e-3]
+
+
+def test_an_encoders_rate_needs_no_encoder_that_learns() -> None:
+    case = case_of(MERLConfig(latent_dim=16, **SMALL), encoder_learning_rate=1e-3)
+    train(case.agent(), case, range(1))

@@ -39,6 +39,7 @@ CASES = [
         images={},
         vectors=STATE,
     ),
+    Case("actors-rate", replace(SMALL, actor_learning_rate=1e-3), images={}, vectors=STATE),
     Case(
         "camera-and-joints",
         replace(SMALL, images=None, vectors=None, latent_dim=48, head_norm=True, conv_channels=8),

@@ -70,6 +70,7 @@ class Case:
             beta_1=c.adam_beta1,
             averaged=(*fusion, "phi_1", "phi_2"),
             reward_scale=c.reward_scale,
+            penalty=c.saturation_penalty,
             bins=c.critic_bins if c.critic_loss == "hl_gauss" else 0,
             low=c.reward_scale * c.critic_low,
             high=c.reward_scale * (100.0 if c.critic_high is None else c.critic_high),

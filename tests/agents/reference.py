@@ -54,6 +54,7 @@ class Spec:
     actor_rate: float = 1e-4
     beta_1: float = 0.9
     reward_scale: float = 1.0
+    penalty: float = 0.0  # of the actor's outputs before the tanh, beyond 1
     bins: int = 0  # of a critic that learns a histogram (HL-Gauss); 0: the squared error
     low: float = 0.0  # bounds of the targets, scaled
     high: float = 100.0
@@ -284,7 +285,15 @@ def actor_loss(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> Tensor:
     """Equation 2; what the critic sees of o_t is a constant, also where its fusion learns here."""
     a = pi(w, h(w, "psi_actor", r, spec), noise, spec)
     r_mm = h(w, "psi_critic", r, spec).detach()
-    return -torch.minimum(q(w, "phi_1", r_mm, a, spec), q(w, "phi_2", r_mm, a, spec)).mean()
+    u = mlp(w, "theta", h(w, "psi_actor", r, spec), spec)
+    least = torch.minimum(q(w, "phi_1", r_mm, a, spec), q(w, "phi_2", r_mm, a, spec))
+    return penalty(u, spec) - least.mean()
+
+
+def penalty(u: Tensor, spec: Spec) -> Tensor:
+    """Of outputs before the tanh, (B, A), by how far they are beyond 1."""
+    excess = torch.where(u.abs() > 1, u.abs() - 1, torch.zeros_like(u))
+    return spec.penalty * (excess**2).mean()
 
 
 # -- algorithm 1 ---------------------------------------------------------------------------------

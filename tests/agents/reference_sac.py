@@ -29,6 +29,7 @@ from reference import (
     h,
     mlp,
     of,
+    penalty,
     q,
     tanh,
 )
@@ -96,7 +97,8 @@ def update(
         a, log_pi = policy(w, features, chance.noise, spec)
         latent = h(w, "psi_critic", features, spec).detach()
         least = torch.minimum(q(w, "phi_1", latent, a, spec), q(w, "phi_2", latent, a, spec))
-        return (alpha * log_pi - least).mean()
+        out = mlp(w, "theta", h(w, "psi_actor", features, spec), spec)
+        return (alpha * log_pi - least).mean() + penalty(out[:, : out.shape[-1] // 2], spec)
 
     loss_2, g_2 = eq_9(w), gradients(eq_9, w, of(w, ("psi_actor", "theta")))
     log_pi = policy(w, features, chance.noise, spec)[1]

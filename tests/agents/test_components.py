@@ -84,3 +84,24 @@ def test_groups_of_step_sizes_are_restored() -> None:
 def test_an_encoders_rate_needs_no_encoder_that_learns() -> None:
     case = case_of(MERLConfig(latent_dim=16, **SMALL), encoder_learning_rate=1e-3)
     train(case.agent(), case, range(1))
+
+
+# -- saturated outputs ---------------------------------------------------------------------------
+
+
+def test_a_penalty_keeps_outputs_from_the_ends_of_the_tanh() -> None:
+    """From outputs that are all far beyond 1; without it they stay there."""
+    config = MERLConfig(latent_dim=16, **SMALL)
+    largest = []
+    for penalty in (0.0, 10.0):
+        case = case_of(config, saturation_penalty=penalty, learning_rate=1e-2)
+        agent = case.agent()
+        actor = agent.networks.actor
+        with torch.no_grad():
+            actor.layers.output.bias[: actor.action_dim] = 4.0
+        train(agent, case, range(60))
+        observation = case.batch_of(0).observation
+        action = agent.act(observation, explore=False)
+        largest.append(float(torch.atanh(action.double()).abs().mean()))
+    assert largest[0] > 3.0
+    assert largest[1] < 1.6

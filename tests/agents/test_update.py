@@ -72,6 +72,7 @@ CASES = [
         "rates-of-their-own",
         replace(SMALL, encoder_learning_rate=1e-3, actor_learning_rate=1e-5, adam_beta1=0.5),
     ),
+    Case("saturation-penalty", replace(SMALL, saturation_penalty=0.7)),
     Case("reward-scale", replace(SMALL, reward_scale=5.0)),
     Case(
         "hl-gauss",
@@ -317,6 +318,7 @@ def test_actions_lie_at_the_clamp_and_beyond(monkeypatch: pytest.MonkeyPatch) ->
         {"encoder_rate": 1.01e-4},
         {"actor_rate": 1.01e-4},
         {"beta_1": 0.91},
+        {"penalty": 1e-3},
     ],
     ids=lambda change: next(iter(change)),
 )

@@ -56,6 +56,9 @@ class AgentConfig:
     actor_every: int = 1
     """The actor learns in every n-th update only (delayed policy updates, TD3); critic, encoders
     and target learn in all."""
+    saturation_penalty: float = 0.0
+    """Weight of mean(max(|u| - 1, 0)^2) in the actor's loss, with u its output before the tanh: it
+    keeps actions from the ends of their range, where the tanh has no gradient."""
     tau: float = 0.01
     """How far the target network moves towards the critic at each update, in (0, 1]."""
     noise_std: float = 0.2
@@ -123,7 +126,7 @@ class AgentConfig:
         if not 0 < self.tau <= 1:
             raise MerlError(f"agent.tau must lie in (0, 1], not {self.tau}")
         ends = () if self.noise_std_end is None else ("noise_std_end",)
-        for name in ("noise_std", *ends):
+        for name in ("noise_std", *ends, "saturation_penalty"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise MerlError(
                     f"agent.{_flag(name)} must be at least 0, not {getattr(self, name)}"

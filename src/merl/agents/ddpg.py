@@ -211,13 +211,20 @@ class DDPG:
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
         """Eq. 2: the actor and its fusion towards actions of higher value; nothing else moves."""
         with self._arithmetic():
-            mean = self.networks.actor(self.networks.actor_latent(encoded))  # (B, A)
+            u = self.networks.actor(self.networks.actor_latent(encoded), tanh=False)  # (B, A)
+            mean = torch.tanh(u)
             loss = -self.q(encoded, clamp_straight_through(mean + noise)).mean()
+            loss = self.with_penalty(loss, u)
         step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         return {
             "actor_loss": loss.detach(),
             "action_saturation": (mean.detach().abs() > 0.95).float().mean(),
         }
+
+    def with_penalty(self, loss: Tensor, u: Tensor) -> Tensor:
+        """The actor's loss, and the price of outputs u (B, A) that lie deep in the tanh's ends."""
+        price = self.config.saturation_penalty
+        return loss + price * torch.relu(u.abs() - 1).square().mean() if price else loss
 
     def q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
         """min_k Q_phi_k(o_t, a), (B,), as a function of the action alone."""

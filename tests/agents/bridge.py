@@ -65,8 +65,12 @@ class Case:
             clip=c.noise_clip,
             tau=c.tau,
             learning_rate=c.learning_rate,
+            encoder_rate=c.encoder_learning_rate or c.learning_rate,
+            actor_rate=c.actor_learning_rate or c.learning_rate,
+            beta_1=c.adam_beta1,
             averaged=(*fusion, "phi_1", "phi_2"),
             reward_scale=c.reward_scale,
+            penalty=c.saturation_penalty,
             bins=c.critic_bins if c.critic_loss == "hl_gauss" else 0,
             low=c.reward_scale * c.critic_low,
             high=c.reward_scale * (100.0 if c.critic_high is None else c.critic_high),
@@ -168,7 +172,7 @@ def warm(agent: DDPG, steps: int = 7, seed: int = 0) -> None:
     """Give Adam a past: second moments over many decades, so that its epsilon counts too."""
     generator = torch.Generator().manual_seed(seed)
     for optimizer in (agent.critic_optimizer, agent.actor_optimizer):
-        for p in optimizer.param_groups[0]["params"]:
+        for p in [p for group in optimizer.param_groups for p in group["params"]]:
             # In the memory order of the parameter: a fused Adam walks them side by side.
             m, v = torch.empty_like(p), torch.empty_like(p)
             v.copy_(10 ** (-16 + 14 * torch.rand(p.shape, generator=generator)))

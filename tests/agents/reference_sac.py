@@ -29,6 +29,7 @@ from reference import (
     h,
     mlp,
     of,
+    penalty,
     q,
     tanh,
 )
@@ -82,32 +83,33 @@ def update(
     soft = torch.minimum(
         q(w, "bar_phi_1", latent_next, a_next, spec), q(w, "bar_phi_2", latent_next, a_next, spec)
     )
-    y = (sample.r + sample.discount * (soft - alpha * log_pi_next)).detach()
+    y = (spec.reward_scale * sample.r + sample.discount * (soft - alpha * log_pi_next)).detach()
     features = encode(w, sample.o, chance.shift, spec)
 
     def eq_5(w: Weights) -> Tensor:
         return critic_loss(w, encode(w, sample.o, chance.shift, spec), sample.a, y, spec)
 
     loss_1, g_1 = eq_5(w), gradients(eq_5, w, of(w, CRITIC_LEARNS))
-    w, critic_adam = adam(w, state.agent.critic_adam, g_1, spec.learning_rate)
+    w, critic_adam = adam(w, state.agent.critic_adam, g_1, spec)
     w = average(w, spec)
 
     def eq_9(w: Weights) -> Tensor:
         a, log_pi = policy(w, features, chance.noise, spec)
         latent = h(w, "psi_critic", features, spec).detach()
         least = torch.minimum(q(w, "phi_1", latent, a, spec), q(w, "phi_2", latent, a, spec))
-        return (alpha * log_pi - least).mean()
+        out = mlp(w, "theta", h(w, "psi_actor", features, spec), spec)
+        return (alpha * log_pi - least).mean() + penalty(out[:, : out.shape[-1] // 2], spec)
 
     loss_2, g_2 = eq_9(w), gradients(eq_9, w, of(w, ("psi_actor", "theta")))
     log_pi = policy(w, features, chance.noise, spec)[1]
-    w, actor_adam = adam(w, state.agent.actor_adam, g_2, spec.learning_rate)
+    w, actor_adam = adam(w, state.agent.actor_adam, g_2, spec)
 
     eq_18: Callable[[Weights], Tensor] = lambda t: (  # noqa: E731
         -t["log_alpha"].exp() * (log_pi + target_entropy)
     ).mean()
     temperature = {"log_alpha": state.log_alpha}
     loss_3, g_3 = eq_18(temperature), gradients(eq_18, temperature, ["log_alpha"])
-    moved, alpha_adam = adam(temperature, state.alpha_adam, g_3, spec.learning_rate)
+    moved, alpha_adam = adam(temperature, state.alpha_adam, g_3, spec)
 
     agent = replace(state.agent, weights=w, critic_adam=critic_adam, actor_adam=actor_adam)
     report = SoftReport(y, loss_1, loss_2, loss_3, -log_pi.mean(), g_1 | g_2 | g_3)

@@ -60,3 +60,48 @@ def test_a_saved_agent_keeps_its_place_between_two_updates_of_the_actor() -> Non
     for each in (agent, resumed):
         train(each, case, range(4, 6))  # the second of these moves the actor
     assert same(agent, resumed)
+
+
+# -- step sizes ----------------------------------------------------------------------------------
+
+
+def test_groups_of_step_sizes_are_restored() -> None:
+    case = Case(
+        "camera",
+        MERLConfig(latent_dim=16, conv_channels=4, encoder_learning_rate=1e-3, **SMALL),
+        images={"image": (16, 16, 1)},
+    )
+    agent, resumed = case.agent(), case.agent(seed=9)
+    train(agent, case, range(2))
+    resumed.load_state_dict(through_a_file(agent.state_dict()))
+    for each in (agent, resumed):
+        train(each, case, range(2, 4))
+    assert same(agent, resumed)
+    rates = [group["lr"] for group in resumed.critic_optimizer.param_groups]
+    assert sorted(rates) == [1e-4, 1e-3]
+
+
+def test_an_encoders_rate_needs_no_encoder_that_learns() -> None:
+    case = case_of(MERLConfig(latent_dim=16, **SMALL), encoder_learning_rate=1e-3)
+    train(case.agent(), case, range(1))
+
+
+# -- saturated outputs ---------------------------------------------------------------------------
+
+
+def test_a_penalty_keeps_outputs_from_the_ends_of_the_tanh() -> None:
+    """From outputs that are all far beyond 1; without it they stay there."""
+    config = MERLConfig(latent_dim=16, **SMALL)
+    largest = []
+    for penalty in (0.0, 10.0):
+        case = case_of(config, saturation_penalty=penalty, learning_rate=1e-2)
+        agent = case.agent()
+        actor = agent.networks.actor
+        with torch.no_grad():
+            actor.layers.output.bias[: actor.action_dim] = 4.0
+        train(agent, case, range(60))
+        observation = case.batch_of(0).observation
+        action = agent.act(observation, explore=False)
+        largest.append(float(torch.atanh(action.double()).abs().mean()))
+    assert largest[0] > 3.0
+    assert largest[1] < 1.6

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
-from merl.agents.ddpg import DDPG, Draws
+from merl.agents import AGENTS, ddpg
+from merl.agents.ddpg import Draws
 from merl.bench.update import ACTIONS, learner_of, noise_batch
 from merl.networks import critic, encoders
 
@@ -32,7 +34,9 @@ def _card(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (encoders, critic):
         monkeypatch.setattr(module, "compute_dtype", lambda weight: weight.dtype)
     monkeypatch.setattr(critic.TwinCritic, "at_once", True)
-    monkeypatch.setattr(DDPG, "_adam", lambda _, weights: torch.optim.Adam(weights, foreach=True))
+    monkeypatch.setattr(
+        ddpg, "adam", lambda weights, *_, **__: torch.optim.Adam(weights, foreach=True)
+    )
 
 
 def draws(size: int) -> Draws:
@@ -41,8 +45,13 @@ def draws(size: int) -> Draws:
     return Draws(shifts, shifts, noise, noise)
 
 
-@pytest.mark.parametrize("agent", ["merl", "drqv2"])
-def test_an_update_asks_the_host_nothing(agent: str) -> None:
+@pytest.mark.parametrize(
+    ("agent", "values"), [("merl", {}), ("drqv2", {}), ("merl", {"critic_loss": "hl_gauss"})]
+)
+def test_an_update_asks_the_host_nothing(
+    agent: str, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(AGENTS, agent, replace(AGENTS[agent], **values))
     learner = learner_of(agent, "fp32", CARD)
     batch = noise_batch(4).to(CARD)
     for _ in range(2):

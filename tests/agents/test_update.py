@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import reference
@@ -25,9 +26,12 @@ from bridge import (
 )
 from torch import Tensor
 
+from merl.agents import ddpg
+from merl.agents.compiling import compile_parts
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
+from merl.agents.networks import Networks
 from merl.networks import augmentation, representation
 from merl.networks.critic import TwinCritic
 
@@ -64,6 +68,11 @@ CASES = [
         replace(SMALL, noise_std=1.0, noise_std_end=0.1, noise_steps=1000),
         step=400,
     ),
+    Case(
+        "rates-of-their-own",
+        replace(SMALL, encoder_learning_rate=1e-3, actor_learning_rate=1e-5, adam_beta1=0.5),
+    ),
+    Case("saturation-penalty", replace(SMALL, saturation_penalty=0.7)),
     Case("reward-scale", replace(SMALL, reward_scale=5.0)),
     Case(
         "hl-gauss",
@@ -221,13 +230,12 @@ def test_compiled(as_on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes a minute, and a C++ compiler."""
     case = replace(CASES[0], config=replace(SMALL, torch_compile="yes"))
     if as_on_a_gpu:
-        compile_heads = DDPG._compile
 
-        def compile_all(agent: DDPG) -> None:
-            compile_heads(agent)
-            agent.networks.encoders.compile(dynamic=False)
+        def compile_all(networks: Networks, *others: Any) -> None:
+            compile_parts(networks, *others)
+            networks.encoders.compile(dynamic=False)
 
-        monkeypatch.setattr(DDPG, "_compile", compile_all)
+        monkeypatch.setattr(ddpg, "compile_parts", compile_all)
         monkeypatch.setattr(TwinCritic, "at_once", True)
         monkeypatch.setattr(representation, "shift", augmentation._shift_by_index)
         monkeypatch.setattr(augmentation, "_centred", augmentation._centred_at_once)
@@ -307,6 +315,10 @@ def test_actions_lie_at_the_clamp_and_beyond(monkeypatch: pytest.MonkeyPatch) ->
         {"tau": 0.0101},
         {"squash": "simplex"},
         {"learning_rate": 1.01e-4},
+        {"encoder_rate": 1.01e-4},
+        {"actor_rate": 1.01e-4},
+        {"beta_1": 0.91},
+        {"penalty": 1e-3},
     ],
     ids=lambda change: next(iter(change)),
 )

@@ -32,7 +32,13 @@ class AgentConfig:
     critic_vectors: tuple[str, ...] = ()
     """Vector keys that the critic alone is told, e.g. `state`: what is known in training only."""
     learning_rate: float = 1e-4
-    """Adam's step size, for every network."""
+    """Adam's step size, for every network that has none of its own."""
+    encoder_learning_rate: float | None = None
+    """Adam's step size for the encoders; `learning_rate`, if not set."""
+    actor_learning_rate: float | None = None
+    """Adam's step size for the actor and its fusion; `learning_rate`, if not set."""
+    adam_beta1: float = 0.9
+    """Decay of Adam's mean of the gradients, in [0, 1); every network's."""
     critic_loss: CriticLoss = "mse"
     """How the critic learns its target: by the mean squared error, or as a histogram over bins by
     cross-entropy (hl_gauss; Farebrother et al. 2024)."""
@@ -50,6 +56,9 @@ class AgentConfig:
     actor_every: int = 1
     """The actor learns in every n-th update only (delayed policy updates, TD3); critic, encoders
     and target learn in all."""
+    saturation_penalty: float = 0.0
+    """Weight of mean(max(|u| - 1, 0)^2) in the actor's loss, with u its output before the tanh: it
+    keeps actions from the ends of their range, where the tanh has no gradient."""
     tau: float = 0.01
     """How far the target network moves towards the critic at each update, in (0, 1]."""
     noise_std: float = 0.2
@@ -101,7 +110,9 @@ class AgentConfig:
     which tries it once on a GPU, for a run that takes long, and keeps it where it is faster."""
 
     def __post_init__(self) -> None:
-        for name in ("learning_rate", "reward_scale"):
+        own = ("encoder_learning_rate", "actor_learning_rate")
+        rates = ("learning_rate", *(name for name in own if getattr(self, name) is not None))
+        for name in (*rates, "reward_scale"):
             if not 0 < getattr(self, name) < math.inf:
                 raise MerlError(f"agent.{_flag(name)} must be above 0, not {getattr(self, name)}")
         for name, value, choices in (
@@ -113,10 +124,12 @@ class AgentConfig:
             ("torch-compile", self.torch_compile, get_args(TorchCompile)),
         ):
             check_choice(f"agent.{name}", value, choices)
+        if not 0 <= self.adam_beta1 < 1:
+            raise MerlError(f"agent.adam-beta1 must lie in [0, 1), not {self.adam_beta1}")
         if not 0 < self.tau <= 1:
             raise MerlError(f"agent.tau must lie in (0, 1], not {self.tau}")
         ends = () if self.noise_std_end is None else ("noise_std_end",)
-        for name in ("noise_std", *ends):
+        for name in ("noise_std", *ends, "saturation_penalty"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise MerlError(
                     f"agent.{_flag(name)} must be at least 0, not {getattr(self, name)}"

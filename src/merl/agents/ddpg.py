@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,9 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from merl.agents.compiling import compile_parts
 from merl.agents.config import AgentConfig
+from merl.agents.gradients import clamp_straight_through, frozen
 from merl.agents.networks import Networks
-from merl.agents.optimizers import load_optimizer, step_optimizer
+from merl.agents.optimizers import adam, load_optimizer, step_optimizer
 from merl.core import Batch, Copies
 from merl.networks.augmentation import Crop, draw_shifts
 from merl.networks.critic import TwinCritic
@@ -93,16 +95,19 @@ class DDPG:
         self.networks = networks.to(device)
         # The target fuses with the most recent weights unless its config averages them too.
         self.critic_target = nn.ModuleDict(copy.deepcopy(self._averaged())).requires_grad_(False)
-        self.critic_parameters = [
-            *networks.encoders.parameters(),
-            *networks.critic_fusion.parameters(),
-            *networks.critic.parameters(),
-        ]
+        encoders = [*networks.encoders.parameters()]
+        critic = [*networks.critic_fusion.parameters(), *networks.critic.parameters()]
+        self.critic_parameters = encoders + critic
         self.actor_parameters = [*self._actors_fusion(), *networks.actor.parameters()]
-        self.critic_optimizer = self._adam(self.critic_parameters)
-        self.actor_optimizer = self._adam(self.actor_parameters)
+        if config.encoder_learning_rate is None:
+            self.critic_optimizer = self._adam(self.critic_parameters)
+        else:
+            self.critic_optimizer = self._adam(critic)
+            group = {"params": encoders, "lr": config.encoder_learning_rate}
+            self.critic_optimizer.add_param_group(group)
+        self.actor_optimizer = self._adam(self.actor_parameters, config.actor_learning_rate)
         if config.torch_compile == "yes":
-            self._compile()
+            compile_parts(self.networks, self.critic_target, self.device)
         words = np.random.SeedSequence(seed).generate_state(2)
         self.acting, self.learning = (
             torch.Generator(device).manual_seed(int(word)) for word in words
@@ -212,13 +217,20 @@ class DDPG:
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
         """Eq. 2: the actor and its fusion towards actions of higher value; nothing else moves."""
         with self._arithmetic():
-            mean = self.networks.actor(self.networks.actor_latent(encoded))  # (B, A)
-            loss = -self.q(encoded, _clamp_straight_through(mean + noise)).mean()
+            u = self.networks.actor(self.networks.actor_latent(encoded), tanh=False)  # (B, A)
+            mean = torch.tanh(u)
+            loss = -self.q(encoded, clamp_straight_through(mean + noise)).mean()
+            loss = self.with_penalty(loss, u)
         step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         return {
             "actor_loss": loss.detach(),
             "action_saturation": (mean.detach().abs() > 0.95).float().mean(),
         }
+
+    def with_penalty(self, loss: Tensor, u: Tensor) -> Tensor:
+        """The actor's loss, and the price of outputs u (B, A) that lie deep in the tanh's ends."""
+        price = self.config.saturation_penalty
+        return loss + price * torch.relu(u.abs() - 1).square().mean() if price else loss
 
     def q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
         """min_k Q_phi_k(o_t, a), (B,), as a function of the action alone."""
@@ -328,47 +340,16 @@ class DDPG:
             parts["critic_fusion"] = self.networks.critic_fusion
         return parts
 
-    def _compile(self) -> None:
-        """Have torch compile what is called in updates."""
-        networks = self.networks
-        parts: list[nn.Module] = [networks.critic_fusion, networks.critic, networks.actor]
-        parts += [] if networks.actor_fusion is None else [networks.actor_fusion]
-        parts += self.critic_target.values()
-        if self.device.type == "cuda":  # shift, interleaving and casts become one kernel
-            parts.append(networks.encoders)  # on a CPU convolutions are no faster for it
-        from torch._dynamo import config as dynamo
-        from torch._functorch import config as functorch
-
-        # Each gradient in the precision of what it is of, as without, not all in autocast's.
-        functorch.backward_pass_autocast = "off"
-        dynamo.recompile_limit = 64  # precisions and threads are tried out: each needs its own
-        for part in parts:
-            part.compile(dynamic=False)
-
     def _arithmetic(self) -> AbstractContextManager[Any]:
         """Autocast to bf16 where that was chosen."""
         enabled = self.config.precision == "bf16"
         return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled)
 
-    def _adam(self, parameters: Sequence[Tensor]) -> torch.optim.Adam:
-        on_gpu = self.device.type == "cuda"  # whose graphs read the step from the device
-        rate = self.config.learning_rate
-        return torch.optim.Adam(parameters, lr=rate, fused=True, capturable=on_gpu)
-
-
-@contextmanager
-def frozen(module: nn.Module) -> Iterator[None]:
-    """No gradient of the module's weights: compiled code would take it, asked for or not."""
-    weights = [weight for weight in module.parameters() if weight.requires_grad]
-    for weight in weights:
-        weight.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for weight in weights:
-            weight.requires_grad_(True)
-
-
-def _clamp_straight_through(action: Tensor) -> Tensor:
-    """The action in [-1, 1], with the gradient as if it had not been clamped."""
-    return action + (action.clamp(-1.0, 1.0) - action).detach()
+    def _adam(self, parameters: Sequence[Tensor], rate: float | None = None) -> torch.optim.Adam:
+        """Adam over these parameters; with the config's rate, if none is given."""
+        return adam(
+            parameters,
+            self.config.learning_rate if rate is None else rate,
+            self.config.adam_beta1,
+            capturable=self.device.type == "cuda",  # its graphs read the step from the device
+        )

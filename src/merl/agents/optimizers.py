@@ -1,4 +1,4 @@
-"""Adam: one step, and its saved state."""
+"""Adam: made, one step, and its saved state."""
 
 from __future__ import annotations
 
@@ -7,6 +7,22 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+
+def adam(
+    parameters: Sequence[Tensor], rate: float, beta1: float, *, capturable: bool
+) -> torch.optim.Adam:
+    """Make Adam over these parameters.
+
+    Args:
+        parameters: to learn.
+        rate: step size.
+        beta1: decay of the mean of the gradients.
+        capturable: whether a CUDA graph can hold its step.
+    """
+    return torch.optim.Adam(
+        parameters, lr=rate, betas=(beta1, 0.999), fused=True, capturable=capturable
+    )
 
 
 def step_optimizer(

@@ -75,9 +75,10 @@ class Actor(nn.Module):
         self.action_dim = action_dim
         self.layers = MLP(latent_dim, action_dim, size)
 
-    def forward(self, latent: Tensor) -> Tensor:
-        """(B, d) to (B, A), in (-1, 1)."""
-        return torch.tanh(self.layers(latent))
+    def forward(self, latent: Tensor, *, tanh: bool = True) -> Tensor:
+        """(B, d) to (B, A), in (-1, 1); without the last tanh, unbounded."""
+        u: Tensor = self.layers(latent)
+        return torch.tanh(u) if tanh else u
 
 
 class GaussianActor(nn.Module):

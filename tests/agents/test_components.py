@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from bridge import Case, weights_of
 from test_determinism import same, through_a_file
+from torch import Tensor
 
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SACConfig
+from merl.training.checkpoint import load_agent, load_networks, save
 
 SMALL = {"hidden_dim": 16, "precision": "fp32"}
 VECTORS = {"images": {}, "vectors": {"state": 9}}
@@ -105,3 +109,77 @@ def test_a_penalty_keeps_outputs_from_the_ends_of_the_tanh() -> None:
         largest.append(float(torch.atanh(action.double()).abs().mean()))
     assert largest[0] > 3.0
     assert largest[1] < 1.6
+
+
+# -- an average of the actor ---------------------------------------------------------------------
+
+AVERAGED = pytest.mark.parametrize(
+    "config",
+    [
+        MERLConfig(latent_dim=16, **SMALL),
+        MERLConfig(latent_dim=16, fusion="shared_by_both", **SMALL),
+        SACConfig(**SMALL),
+    ],
+    ids=["merl", "shared fusion", "sac"],
+)
+
+
+def as_it_acts(agent: DDPG, weights: Mapping[str, Tensor], case: Case) -> Tensor:
+    """The action that these weights of its networks give."""
+    twin = replace(case, config=replace(case.config, actor_average=None)).agent()
+    twin.networks.load_state_dict(weights)
+    return twin.act(case.batch_of(99).observation, explore=False)
+
+
+@AVERAGED
+def test_evaluation_acts_by_the_average_and_exploration_by_the_newest(config: AgentConfig) -> None:
+    case = case_of(config, actor_average=0.25, learning_rate=1e-2, noise_std=0.0)
+    agent = case.agent()
+
+    def newest() -> dict[str, Tensor]:
+        state = agent.networks.state_dict()
+        return {k: v.clone() for k, v in state.items() if not k.startswith("policy_average")}
+
+    fusion = "critic_fusion." if config.fusion == "shared_by_both" else "actor_fusion."
+    averaged = newest()
+    for seed in range(4):
+        agent.update(case.batch_of(seed))
+        recent = newest()
+        averaged |= {
+            name: torch.lerp(averaged[name], recent[name], 0.25)
+            for name in recent
+            if name.startswith((fusion, "actor."))
+        }
+    observation = case.batch_of(99).observation
+    calm = agent.act(observation, explore=False)
+    torch.testing.assert_close(calm, as_it_acts(agent, recent | averaged, case))
+    assert not torch.allclose(calm, as_it_acts(agent, recent, case), atol=1e-3)
+    if not isinstance(config, SACConfig):  # whose noise is the policy's own
+        exploring = agent.act(observation, explore=True)
+        torch.testing.assert_close(exploring, as_it_acts(agent, recent, case))
+
+
+@AVERAGED
+def test_an_average_changes_nothing_of_what_is_learnt(config: AgentConfig) -> None:
+    plain, kept = (case_of(config, actor_average=share).agent() for share in (None, 0.1))
+    case = case_of(config)
+    for agent in (plain, kept):
+        train(agent, case, range(3))
+    expected, found = plain.networks.state_dict(), kept.networks.state_dict()
+    assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_an_average_is_in_the_weights_that_a_checkpoint_holds(tmp_path: Path) -> None:
+    case = case_of(MERLConfig(latent_dim=16, **SMALL), actor_average=0.1, learning_rate=1e-2)
+    agent, resumed, deployed = case.agent(), case.agent(seed=8), case.agent(seed=9)
+    train(agent, case, range(3))
+    saved = save(tmp_path, 3, agent, {}, score=None, keep=1)
+    load_networks(deployed.networks, saved)
+    load_agent(resumed, saved)
+    observation = case.batch_of(99).observation
+    expected = agent.act(observation, explore=False)
+    for each in (resumed, deployed):
+        assert torch.equal(each.act(observation, explore=False), expected)
+    for each in (agent, resumed):
+        train(each, case, range(3, 5))
+    assert same(agent, resumed)

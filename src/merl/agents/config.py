@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -56,6 +57,10 @@ class AgentConfig:
     actor_every: int = 1
     """The actor learns in every n-th update only (delayed policy updates, TD3); critic, encoders
     and target learn in all."""
+    actor_average: float | None = None
+    """Evaluate and deploy an exponential moving average of the actor and its fusion, which moves by
+    this share towards the newest weights whenever the actor learns, in (0, 1], e.g. 0.001; if not
+    set, the newest weights. Exploration and updates always use the newest."""
     saturation_penalty: float = 0.0
     """Weight of mean(max(|u| - 1, 0)^2) in the actor's loss, with u its output before the tanh: it
     keeps actions from the ends of their range, where the tanh has no gradient."""
@@ -107,11 +112,10 @@ class AgentConfig:
     which tries it once on a GPU, for a run that takes long, and keeps it where it is faster."""
 
     def __post_init__(self) -> None:
-        own = ("encoder_learning_rate", "actor_learning_rate")
-        rates = ("learning_rate", *(name for name in own if getattr(self, name) is not None))
-        for name in (*rates, "reward_scale"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise MerlError(f"agent.{_flag(name)} must be above 0, not {getattr(self, name)}")
+        rates = ("learning_rate", "encoder_learning_rate", "actor_learning_rate")
+        for name, value in self._given(*rates, "reward_scale"):
+            if not 0 < value < math.inf:
+                raise MerlError(f"agent.{_flag(name)} must be above 0, not {value}")
         for name, value, choices in (
             ("precision", self.precision, get_args(Precision)),
             ("target", self.target, get_args(Target)),
@@ -123,14 +127,12 @@ class AgentConfig:
             check_choice(f"agent.{name}", value, choices)
         if not 0 <= self.adam_beta1 < 1:
             raise MerlError(f"agent.adam-beta1 must lie in [0, 1), not {self.adam_beta1}")
-        if not 0 < self.tau <= 1:
-            raise MerlError(f"agent.tau must lie in (0, 1], not {self.tau}")
-        ends = () if self.noise_std_end is None else ("noise_std_end",)
-        for name in ("noise_std", *ends, "saturation_penalty"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise MerlError(
-                    f"agent.{_flag(name)} must be at least 0, not {getattr(self, name)}"
-                )
+        for name, value in self._given("tau", "actor_average"):
+            if not 0 < value <= 1:
+                raise MerlError(f"agent.{_flag(name)} must lie in (0, 1], not {value}")
+        for name, value in self._given("noise_std", "noise_std_end", "saturation_penalty"):
+            if not 0 <= value < math.inf:
+                raise MerlError(f"agent.{_flag(name)} must be at least 0, not {value}")
         if not self.noise_clip >= 0:
             raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
         least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1, "noise_steps": 1}
@@ -155,6 +157,10 @@ class AgentConfig:
                 f"agent.conv-strides {self.conv_strides} must name a stride of at least 1 for each "
                 "convolution"
             )
+
+    def _given(self, *names: str) -> Iterator[tuple[str, float]]:
+        """Those of these fields that are set, with their values."""
+        return ((name, value) for name in names if (value := getattr(self, name)) is not None)
 
     def _check_histogram(self) -> None:
         for name in ("critic_bins", "critic_low", "critic_high"):

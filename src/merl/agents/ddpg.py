@@ -126,12 +126,12 @@ class DDPG:
 
         Args:
             observation: images uint8 (B, K, H, W, C), vectors float32 (B, n), on the device.
-            explore: add the noise.
+            explore: add the noise; without, the actor's average acts where one is kept.
 
         Returns:
             Actions (B, A), in [-1, 1].
         """
-        mean: Tensor = self._policy(observation)
+        mean: Tensor = self._policy(observation, averaged=not explore)
         if not explore:
             return mean
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
@@ -162,6 +162,8 @@ class DDPG:
             # The encoders' features of o_t serve again, from before the critic's step and detached.
             encoded = {key: features.detach() for key, features in encoded.items()}
             metrics |= self.update_actor(encoded, draws.actor_noise)
+            if self.config.actor_average is not None:
+                self.networks.update_average(self.config.actor_average)
         self.update_target()
         self.updates += 1
         return metrics
@@ -302,14 +304,14 @@ class DDPG:
 
     # ----------------------------------------------------------------------------------------
 
-    def _policy(self, observation: Mapping[str, Tensor]) -> Any:
+    def _policy(self, observation: Mapping[str, Tensor], *, averaged: bool) -> Any:
         """What the actor makes of what it senses; what only the critic is told may be absent."""
         networks = self.networks
         sensed = {key: observation[key] for key in networks.senses}
         # As it is written: batches of acting come in sizes that would each have to be compiled.
         compiled = self.config.torch_compile == "yes"
         with torch.compiler.set_stance("force_eager") if compiled else nullcontext():
-            return networks.actor(networks.actor_latent(networks.encoders(sensed)))
+            return networks.policy(networks.encoders(sensed), averaged=averaged)
 
     def _actors_fusion(self) -> Iterator[nn.Parameter]:
         """The fusion that the actor's loss moves: its own, or by name the critic's too."""

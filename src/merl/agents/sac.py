@@ -91,7 +91,7 @@ class SAC(DDPG):
     @torch.inference_mode()
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
         """tanh(u), u ~ N(mu, sigma^2) when exploring, else tanh(mu); see `DDPG.act`."""
-        mean, log_std = self._policy(observation)
+        mean, log_std = self._policy(observation, averaged=not explore)
         if not explore:
             return torch.tanh(mean)
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)

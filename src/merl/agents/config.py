@@ -116,7 +116,7 @@ class AgentConfig:
         for name, value in self._given(*rates, "reward_scale"):
             if not 0 < value < math.inf:
                 raise MerlError(f"agent.{_flag(name)} must be above 0, not {value}")
-        for name, value, choices in (
+        for name, choice, choices in (
             ("precision", self.precision, get_args(Precision)),
             ("target", self.target, get_args(Target)),
             ("squash", self.squash, get_args(Squash)),
@@ -124,7 +124,7 @@ class AgentConfig:
             ("fusion", self.fusion, get_args(FusionOwner)),
             ("torch-compile", self.torch_compile, get_args(TorchCompile)),
         ):
-            check_choice(f"agent.{name}", value, choices)
+            check_choice(f"agent.{name}", choice, choices)
         if not 0 <= self.adam_beta1 < 1:
             raise MerlError(f"agent.adam-beta1 must lie in [0, 1), not {self.adam_beta1}")
         for name, value in self._given("tau", "actor_average"):

@@ -15,7 +15,8 @@ import torch
 from bridge import Case, named_cases, weights_of
 from torch import Tensor, nn
 
-from merl.agents.ddpg import DDPG, DDPGConfig, Draws
+from merl.agents.ddpg import DDPG, DDPGConfig
+from merl.agents.draws import Draws
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
 from merl.core import Batch

@@ -51,6 +51,10 @@ class AgentConfig:
     critic_high: float | None = None
     """The highest; if not set, 1 / (1 - discount), which no return exceeds as long as rewards lie
     in [0, 1]. Higher targets count as this one: with rewards above 1 set it."""
+    critic_batch_norm: bool = False
+    """BatchNorm in the critic's hidden layers, in place of `head_norm`'s (CrossQ, Bhatt et al.
+    2024): one pass over (o, a) and (o', a') gives the values and the target, without a target
+    network; the actor's loss uses running statistics."""
     reward_scale: float = 1.0
     """Factor of the rewards that the critic learns from; metrics of Q stay in the environment's
     unit, losses do not."""
@@ -145,6 +149,10 @@ class AgentConfig:
                     f"agent.{_flag(name)} must be at least {bound} and at most {most}, "
                     f"not {getattr(self, name)}"
                 )
+        if self.critic_batch_norm and self.head_layers == 1:
+            raise MerlError(
+                "agent.critic-batch-norm needs a hidden layer: use at least 2 agent.head-layers"
+            )
         self._check_histogram()
         for name in ("fusion", "fusion_norm", "squash"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):

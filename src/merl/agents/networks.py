@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -127,8 +128,9 @@ def make_networks(
     actor_fusion = None
     if config.fusion == "decoupled":
         actor_fusion = _fusion(config, senses, share)
-    size = HeadSize(config.head_layers, config.hidden_dim, config.head_norm)
-    critic = TwinCritic(critic_fusion.latent_dim, action_dim, size, _returns(config))
+    size = HeadSize(config.head_layers, config.hidden_dim, "layer" if config.head_norm else "none")
+    of_critic = dataclasses.replace(size, norm="batch") if config.critic_batch_norm else size
+    critic = TwinCritic(critic_fusion.latent_dim, action_dim, of_critic, _returns(config))
     policy = actor((actor_fusion or critic_fusion).latent_dim, action_dim, size)
     networks = Networks(encoders, critic_fusion, critic, actor_fusion, policy)
     orthogonal(networks)

@@ -265,3 +265,34 @@ def test_a_critic_with_batch_norm_has_no_target_and_goes_on_where_it_was_saved(
 def test_batch_norm_needs_a_hidden_layer() -> None:
     with pytest.raises(MerlError, match=r"critic-batch-norm .* at least 2 agent.head-layers"):
         MERLConfig(critic_batch_norm=True, head_layers=1)
+
+
+# -- all together --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"critic_loss": "hl_gauss"},
+        {"critic_batch_norm": True},
+        {
+            "critic_loss": "hl_gauss",
+            "critic_batch_norm": True,
+            "reward_scale": 2.0,
+            "actor_average": 0.1,
+            "saturation_penalty": 0.1,
+            "encoder_learning_rate": 1e-3,
+        },
+    ],
+    ids=["none", "hl_gauss", "batch norm", "all"],
+)
+@AGENTS
+def test_metrics_are_plain_numbers(config: AgentConfig, values: dict[str, object]) -> None:
+    """A metric with a gradient would keep the graphs of all updates in memory."""
+    if isinstance(config, SACConfig):
+        values = {name: value for name, value in values.items() if name != "critic_loss"}
+    case = case_of(config, **values)
+    metrics = case.agent().update(case.batch_of(0))
+    assert not [name for name, value in metrics.items() if value.requires_grad or value.ndim]
+    assert all(value.isfinite() for value in metrics.values())

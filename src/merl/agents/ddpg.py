@@ -179,8 +179,7 @@ class DDPG:
         y = reward + batch.discount * (next_q + bonus)  # (B,)
         loss = networks.critic.returns.loss(first, second, y)
         step_optimizer(self.critic_optimizer, loss, self.critic_parameters)
-        with torch.no_grad():
-            q1, q2 = (networks.critic.returns.value(output) for output in (first, second))
+        q1, q2 = (networks.critic.returns.value(output.detach()) for output in (first, second))
         unit = self.config.reward_scale  # values are reported in the unit of the rewards
         return {
             "critic_loss": loss.detach(),

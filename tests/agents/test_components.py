@@ -68,6 +68,15 @@ def test_a_saved_agent_keeps_its_place_between_two_updates_of_the_actor() -> Non
     assert same(agent, resumed)
 
 
+def test_a_checkpoint_without_a_count_of_updates_can_be_loaded() -> None:
+    case = case_of(MERLConfig(latent_dim=16, **SMALL))
+    state = case.agent().state_dict()
+    del state["updates"]
+    agent = case.agent(seed=9)
+    agent.load_state_dict(state)
+    assert agent.updates == 0
+
+
 # -- step sizes ----------------------------------------------------------------------------------
 
 

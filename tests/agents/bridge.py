@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG, Draws
+from merl.agents.ddpg import DDPG
+from merl.agents.draws import Draws
 from merl.core import Batch
 
 STACK = 3

@@ -8,24 +8,28 @@ every processor, which a hash of the weights would not be.
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from bridge import Case, named_cases, weights_of
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
-from merl.agents.ddpg import DDPG, DDPGConfig, Draws
+from merl.agents.ddpg import DDPG, DDPGConfig
+from merl.agents.draws import Draws
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
+from merl.agents.sac import SAC, SACConfig
 from merl.core import Batch
-from merl.networks.heads import Actor
 
 SMALL = {"conv_channels": 8, "hidden_dim": 32}
 CASES = [
     Case("merl", MERLConfig(latent_dim=48, **SMALL)),
     Case("drqv2", DrQV2Config(**SMALL), vectors={}),
     Case("ddpg", DDPGConfig(**SMALL), images={}, vectors={"state": 9}),
+    Case("sac", SACConfig(hidden_dim=32), images={}, vectors={"state": 9}),
 ]
 
 
@@ -46,41 +50,47 @@ class WrittenOut:
         )
 
     def learn(self, batch: Batch, draws: Draws) -> None:
-        n = self.networks
-        bf16 = self.config.precision == "bf16"
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        n, tau = self.networks, self.config.tau
+        with self.arithmetic():
             encoded = n.encoders(batch.observation, draws.shifts)
             with torch.no_grad():
                 next_encoded = n.encoders(batch.next_observation, draws.next_shifts)
-                next_action = (self.policy(next_encoded) + draws.next_noise).clamp(-1.0, 1.0)
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16), torch.no_grad():
-            averaged = "critic_fusion" in self.target
-            latent = (self.target if averaged else n._modules)["critic_fusion"](next_encoded)
-            next_q = torch.minimum(*self.twins(self.target["critic"], latent, next_action))
-            y = batch.reward + batch.discount * next_q
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        with self.arithmetic(), torch.no_grad():
+            y = batch.reward + batch.discount * self.next_value(next_encoded, draws.next_noise)
+        with self.arithmetic():
             q1, q2 = self.twins(n.critic, n.critic_fusion(encoded), batch.action)
         loss = (q1 - y).square().mean() + (q2 - y).square().mean()
         self.descend(self.critic_adam, loss, self.critic_weights)
-
-        encoded = {key: value.detach() for key, value in encoded.items()}
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            action = self.policy(encoded) + draws.actor_noise
-            action = action + (action.clamp(-1.0, 1.0) - action).detach()
-            with torch.no_grad():
-                latent = n.critic_fusion(encoded)
-            q1, q2 = self.twins(n.critic, latent, action)
-            loss = -torch.minimum(q1, q2).mean()
-        self.descend(self.actor_adam, loss, self.actor_weights)
-
+        self.update_actor({k: value.detach() for k, value in encoded.items()}, draws.actor_noise)
         recent = dict(n.named_parameters())
         with torch.no_grad():
             for name, average in self.target.named_parameters():
-                average.lerp_(recent[name], self.config.tau)
+                average.lerp_(recent[name], tau)
+
+    def next_value(self, next_encoded: dict[str, Tensor], noise: Tensor) -> Tensor:
+        return self.target_q(next_encoded, (self.policy(next_encoded) + noise).clamp(-1.0, 1.0))
+
+    def target_q(self, next_encoded: dict[str, Tensor], action: Tensor) -> Tensor:
+        averaged = "critic_fusion" in self.target
+        fusion = (self.target if averaged else self.networks._modules)["critic_fusion"]
+        return torch.minimum(*self.twins(self.target["critic"], fusion(next_encoded), action))
+
+    def update_actor(self, encoded: dict[str, Tensor], noise: Tensor) -> None:
+        with self.arithmetic():
+            action = self.policy(encoded) + noise
+            action = action + (action.clamp(-1.0, 1.0) - action).detach()
+            loss = -self.q(encoded, action).mean()
+        self.descend(self.actor_adam, loss, self.actor_weights)
+
+    def q(self, encoded: dict[str, Tensor], action: Tensor) -> Tensor:
+        with torch.no_grad():
+            latent = self.networks.critic_fusion(encoded)
+        return torch.minimum(*self.twins(self.networks.critic, latent, action))
+
+    def arithmetic(self) -> torch.autocast:
+        return torch.autocast("cpu", torch.bfloat16, enabled=self.config.precision == "bf16")
 
     def policy(self, encoded: dict[str, Tensor]) -> Tensor:
-        assert isinstance(self.networks.actor, Actor)
-        assert self.networks.actor_fusion is not None
         return torch.tanh(self.networks.actor.layers(self.networks.actor_fusion(encoded)))
 
     @staticmethod
@@ -100,12 +110,49 @@ class WrittenOut:
         }
 
 
+class WrittenOutSAC(WrittenOut):
+    """With a Gaussian policy, and the temperature's step."""
+
+    def __init__(self, agent: SAC) -> None:
+        super().__init__(agent)
+        self.log_alpha = agent.log_alpha.detach().clone().requires_grad_()
+        rate = self.config.learning_rate
+        self.alpha_adam = torch.optim.Adam([self.log_alpha], lr=rate, fused=True)
+
+    def sample(self, encoded: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
+        out = self.networks.actor.layers(self.networks.actor_fusion(encoded))
+        mean, raw = out.chunk(2, dim=-1)
+        log_std = -10.0 + (2.0 - -10.0) * (torch.tanh(raw) + 1) / 2
+        u = mean + log_std.exp() * noise
+        gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        squashed = 2 * (math.log(2) - u - softplus(-2 * u))
+        return torch.tanh(u), (gaussian - squashed).sum(-1)
+
+    def next_value(self, next_encoded: dict[str, Tensor], noise: Tensor) -> Tensor:
+        action, log_prob = self.sample(next_encoded, noise)
+        return self.target_q(next_encoded, action) - self.log_alpha.exp() * log_prob
+
+    def update_actor(self, encoded: dict[str, Tensor], noise: Tensor) -> None:
+        with self.arithmetic():
+            action, log_prob = self.sample(encoded, noise)
+            q = self.q(encoded, action)
+        loss = (self.log_alpha.exp().detach() * log_prob - q).mean()
+        self.descend(self.actor_adam, loss, self.actor_weights)
+        entropy = -log_prob.detach().mean()
+        loss = self.log_alpha.exp() * (entropy + action.shape[1])
+        self.descend(self.alpha_adam, loss, [self.log_alpha])
+
+    def weights(self) -> dict[str, Tensor]:
+        return super().weights() | {"log_alpha": self.log_alpha.detach()}
+
+
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @named_cases(*CASES)
 def test_five_updates_bit_for_bit(case: Case, precision: str) -> None:
     case = replace(case, config=replace(case.config, precision=precision))
     agent = case.agent()
-    expected = WrittenOut(agent)
+    sac = isinstance(agent, SAC)
+    expected = WrittenOutSAC(agent) if sac else WrittenOut(agent)
     for seed in range(5):
         batch = case.batch_of(seed)
         draws = agent.draw(case.batch)
@@ -114,6 +161,8 @@ def test_five_updates_bit_for_bit(case: Case, precision: str) -> None:
     found = agent.networks.state_dict() | {
         f"target.{name}": value for name, value in agent.critic_target.state_dict().items()
     }
+    if sac:
+        found["log_alpha"] = agent.log_alpha.detach()
     truth = expected.weights()
     assert found.keys() == truth.keys()
     assert [name for name in found if not torch.equal(found[name], truth[name])] == []

@@ -111,6 +111,7 @@ def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str
         ("actor_learning_rate", float("inf")),
         ("adam_beta1", 1.0),
         ("saturation_penalty", -1.0),
+        ("actor_average", 0.0),
         ("tau", 0.0),
         ("tau", 1.01),
         ("noise_std", -0.1),

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from merl.agents import AGENTS, ddpg
-from merl.agents.ddpg import Draws
+from merl.agents.draws import Draws
 from merl.bench.update import ACTIONS, learner_of, noise_batch
 from merl.networks import critic, encoders
 
@@ -46,7 +46,14 @@ def draws(size: int) -> Draws:
 
 
 @pytest.mark.parametrize(
-    ("agent", "values"), [("merl", {}), ("drqv2", {}), ("merl", {"critic_loss": "hl_gauss"})]
+    ("agent", "values"),
+    [
+        ("merl", {}),
+        ("drqv2", {}),
+        ("merl", {"critic_loss": "hl_gauss"}),
+        ("merl", {"critic_batch_norm": True}),
+        ("merl", {"actor_average": 0.1, "saturation_penalty": 1.0, "reward_scale": 2.0}),
+    ],
 )
 def test_an_update_asks_the_host_nothing(
     agent: str, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch

@@ -25,7 +25,7 @@ from bridge import (
     weights_of,
 )
 
-from merl.agents.ddpg import Draws
+from merl.agents.draws import Draws
 from merl.agents.sac import SAC, SACConfig
 from merl.core import Batch, MerlError
 

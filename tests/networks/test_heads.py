@@ -7,17 +7,17 @@ import torch
 from torch import nn
 
 from merl.networks.critic import TwinCritic
-from merl.networks.heads import MLP, Actor, HeadSize
+from merl.networks.heads import MLP, Actor, HeadSize, Norm
 
 
 @pytest.mark.parametrize("layers", [1, 3, 6])
-@pytest.mark.parametrize("layer_norm", [True, False])
-def test_the_output_layer_is_counted(layers: int, layer_norm: bool) -> None:
-    head = MLP(10, 4, HeadSize(layers, 16, layer_norm))
+@pytest.mark.parametrize("norm", ["layer", "none"])
+def test_the_output_layer_is_counted(layers: int, norm: Norm) -> None:
+    head = MLP(10, 4, HeadSize(layers, 16, norm))
     kinds = [type(m) for m in head.modules()]
     linear = sum(isinstance(m, nn.Linear) for m in head.modules())
     assert linear == layers
-    assert kinds.count(nn.LayerNorm) == (layers - 1 if layer_norm else 0)
+    assert kinds.count(nn.LayerNorm) == (layers - 1 if norm == "layer" else 0)
     assert head(torch.randn(5, 10)).shape == (5, 4)
 
 
@@ -43,10 +43,10 @@ def test_the_twins_are_apart() -> None:
 
 
 @pytest.mark.parametrize("layers", [1, 4])
-@pytest.mark.parametrize("layer_norm", [True, False])
-def test_the_twins_at_once_are_the_twins_one_by_one(layers: int, layer_norm: bool) -> None:
+@pytest.mark.parametrize("norm", ["layer", "none"])
+def test_the_twins_at_once_are_the_twins_one_by_one(layers: int, norm: Norm) -> None:
     """Values, and gradients of the action and of every weight; in bf16, too."""
-    critic = TwinCritic(10, 4, HeadSize(layers, 32, layer_norm)).double()
+    critic = TwinCritic(10, 4, HeadSize(layers, 32, norm)).double()
     for parameter in critic.parameters():
         nn.init.normal_(parameter, 0.0, 0.3)
     latent, action = torch.randn(50, 10), torch.rand(50, 4, requires_grad=True)

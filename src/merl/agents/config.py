@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -50,12 +51,20 @@ class AgentConfig:
     critic_high: float | None = None
     """The highest; if not set, 1 / (1 - discount), which no return exceeds as long as rewards lie
     in [0, 1]. Higher targets count as this one: with rewards above 1 set it."""
+    critic_batch_norm: bool = False
+    """BatchNorm in the critic's hidden layers, in place of `head_norm`'s (CrossQ, Bhatt et al.
+    2024): one pass over (o, a) and (o', a') gives the values and the target, without a target
+    network; the actor's loss uses running statistics."""
     reward_scale: float = 1.0
     """Factor of the rewards that the critic learns from; metrics of Q stay in the environment's
     unit, losses do not."""
     actor_every: int = 1
     """The actor learns in every n-th update only (delayed policy updates, TD3); critic, encoders
     and target learn in all."""
+    actor_average: float | None = None
+    """Evaluate and deploy an exponential moving average of the actor and its fusion, which moves by
+    this share towards the newest weights whenever the actor learns, in (0, 1], e.g. 0.001; if not
+    set, the newest weights. Exploration and updates always use the newest."""
     saturation_penalty: float = 0.0
     """Weight of mean(max(|u| - 1, 0)^2) in the actor's loss, with u its output before the tanh: it
     keeps actions from the ends of their range, where the tanh has no gradient."""
@@ -110,12 +119,11 @@ class AgentConfig:
     which tries it once on a GPU, for a run that takes long, and keeps it where it is faster."""
 
     def __post_init__(self) -> None:
-        own = ("encoder_learning_rate", "actor_learning_rate")
-        rates = ("learning_rate", *(name for name in own if getattr(self, name) is not None))
-        for name in (*rates, "reward_scale"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise MerlError(f"agent.{_flag(name)} must be above 0, not {getattr(self, name)}")
-        for name, value, choices in (
+        rates = ("learning_rate", "encoder_learning_rate", "actor_learning_rate")
+        for name, value in self._given(*rates, "reward_scale"):
+            if not 0 < value < math.inf:
+                raise MerlError(f"agent.{_flag(name)} must be above 0, not {value}")
+        for name, choice, choices in (
             ("precision", self.precision, get_args(Precision)),
             ("target", self.target, get_args(Target)),
             ("squash", self.squash, get_args(Squash)),
@@ -123,17 +131,15 @@ class AgentConfig:
             ("fusion", self.fusion, get_args(FusionOwner)),
             ("torch-compile", self.torch_compile, get_args(TorchCompile)),
         ):
-            check_choice(f"agent.{name}", value, choices)
+            check_choice(f"agent.{name}", choice, choices)
         if not 0 <= self.adam_beta1 < 1:
             raise MerlError(f"agent.adam-beta1 must lie in [0, 1), not {self.adam_beta1}")
-        if not 0 < self.tau <= 1:
-            raise MerlError(f"agent.tau must lie in (0, 1], not {self.tau}")
-        ends = () if self.noise_std_end is None else ("noise_std_end",)
-        for name in ("noise_std", *ends, "saturation_penalty"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise MerlError(
-                    f"agent.{_flag(name)} must be at least 0, not {getattr(self, name)}"
-                )
+        for name, value in self._given("tau", "actor_average"):
+            if not 0 < value <= 1:
+                raise MerlError(f"agent.{_flag(name)} must lie in (0, 1], not {value}")
+        for name, value in self._given("noise_std", "noise_std_end", "saturation_penalty"):
+            if not 0 <= value < math.inf:
+                raise MerlError(f"agent.{_flag(name)} must be at least 0, not {value}")
         if not 0 <= self.noise_correlation < 1:
             raise MerlError(
                 f"agent.noise-correlation must lie in [0, 1), not {self.noise_correlation}"
@@ -150,6 +156,10 @@ class AgentConfig:
                     f"agent.{_flag(name)} must be at least {bound} and at most {most}, "
                     f"not {getattr(self, name)}"
                 )
+        if self.critic_batch_norm and self.head_layers == 1:
+            raise MerlError(
+                "agent.critic-batch-norm needs a hidden layer: use at least 2 agent.head-layers"
+            )
         self._check_histogram()
         for name in ("fusion", "fusion_norm", "squash"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):
@@ -162,6 +172,10 @@ class AgentConfig:
                 f"agent.conv-strides {self.conv_strides} must name a stride of at least 1 for each "
                 "convolution"
             )
+
+    def _given(self, *names: str) -> Iterator[tuple[str, float]]:
+        """Those of these fields that are set, with their values."""
+        return ((name, value) for name in names if (value := getattr(self, name)) is not None)
 
     def _check_histogram(self) -> None:
         for name in ("critic_bins", "critic_low", "critic_high"):

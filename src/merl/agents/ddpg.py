@@ -21,7 +21,8 @@ from torch import Tensor, nn
 
 from merl.agents.compiling import compile_parts
 from merl.agents.config import AgentConfig
-from merl.agents.gradients import clamp_straight_through, frozen
+from merl.agents.draws import Draws
+from merl.agents.gradients import clamp_straight_through, frozen, judging
 from merl.agents.networks import Networks
 from merl.agents.optimizers import adam, load_optimizer, step_optimizer
 from merl.core import Batch, Copies
@@ -42,23 +43,6 @@ class DDPGConfig(AgentConfig):
     """d, the length of a fused representation; 0 is none: the state goes to the heads as it is."""
     head_norm: bool = False
     """LayerNorm in the hidden layers of actor and critic."""
-
-
-@dataclass(frozen=True)
-class Draws:
-    """The random numbers of one update.
-
-    Attributes:
-        shifts: crops of o_t, per image key int64 (B, 2); none where the batch is shifted already.
-        next_shifts: crops of o_{t+n}, likewise.
-        next_noise: epsilon of the target's action, (B, A): clipped here, standard normal in SAC.
-        actor_noise: epsilon of the actor's action, likewise.
-    """
-
-    shifts: dict[str, Tensor]
-    next_shifts: dict[str, Tensor]
-    next_noise: Tensor
-    actor_noise: Tensor
 
 
 class DDPG:
@@ -127,12 +111,12 @@ class DDPG:
 
         Args:
             observation: images uint8 (B, K, H, W, C), vectors float32 (B, n), on the device.
-            explore: add the noise.
+            explore: add the noise; without, the actor's average acts where one is kept.
 
         Returns:
             Actions (B, A), in [-1, 1].
         """
-        mean: Tensor = self._policy(observation)
+        mean: Tensor = self._policy(observation, averaged=not explore)
         if not explore:
             return mean
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
@@ -168,6 +152,8 @@ class DDPG:
             # The encoders' features of o_t serve again, from before the critic's step and detached.
             encoded = {key: features.detach() for key, features in encoded.items()}
             metrics |= self.update_actor(encoded, draws.actor_noise)
+            if self.config.actor_average is not None:
+                self.networks.update_average(self.config.actor_average)
         self.update_target()
         self.updates += 1
         return metrics
@@ -183,15 +169,23 @@ class DDPG:
         networks = self.networks
         # Apart: autocast would hand weights that it cast without a gradient to what needs one.
         with self._arithmetic(), torch.no_grad():
-            reward = self.config.reward_scale * batch.reward
-            y = reward + batch.discount * self.next_value(next_encoded, next_noise)  # (B,)
+            next_action, bonus = self.next_action(next_encoded, next_noise)
+            if self.config.critic_batch_norm:
+                next_latent = networks.critic_fusion(next_encoded)
+            else:
+                next_q = self.target_q(next_encoded, next_action)
         with self._arithmetic():
             latent = networks.critic_fusion(encoded)  # (B, d)
-            first, second = networks.critic(latent, batch.action)
+            if self.config.critic_batch_norm:
+                joint = latent, batch.action, next_latent, next_action
+                first, second, next_q = networks.critic.joint(*joint)
+            else:
+                first, second = networks.critic(latent, batch.action)
+        reward = self.config.reward_scale * batch.reward
+        y = reward + batch.discount * (next_q + bonus)  # (B,)
         loss = networks.critic.returns.loss(first, second, y)
         step_optimizer(self.critic_optimizer, loss, self.critic_parameters)
-        with torch.no_grad():
-            q1, q2 = (networks.critic.returns.value(output) for output in (first, second))
+        q1, q2 = (networks.critic.returns.value(output.detach()) for output in (first, second))
         unit = self.config.reward_scale  # values are reported in the unit of the rewards
         return {
             "critic_loss": loss.detach(),
@@ -201,10 +195,12 @@ class DDPG:
             "reward": batch.reward.mean(),
         }
 
-    def next_value(self, next_encoded: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """min_k Q_phi_k-bar(o_{t+n}, pi(o_{t+n}) + epsilon), (B,)."""
+    def next_action(
+        self, next_encoded: Mapping[str, Tensor], noise: Tensor
+    ) -> tuple[Tensor, Tensor | float]:
+        """pi(o_{t+n}) + epsilon, (B, A), and what is added to its value: nothing."""
         action = self.networks.actor(self.networks.actor_latent(next_encoded)) + noise
-        return self.target_q(next_encoded, action.clamp(-1.0, 1.0))
+        return action.clamp(-1.0, 1.0), 0.0
 
     def target_q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
         """The lesser of the averaged critic's two values, (B,)."""
@@ -236,7 +232,7 @@ class DDPG:
         """min_k Q_phi_k(o_t, a), (B,), as a function of the action alone."""
         with torch.no_grad():
             latent = self.networks.critic_fusion(encoded)
-        with frozen(self.networks.critic):
+        with frozen(self.networks.critic), judging(self.networks.critic):
             q1, q2 = self.networks.critic.values(latent, action)
         return torch.minimum(q1, q2)
 
@@ -245,7 +241,8 @@ class DDPG:
         """phi_bar <- (1 - tau) phi_bar + tau phi."""
         average: list[Tensor] = list(self.critic_target.parameters())
         recent: list[Tensor] = [p for part in self._averaged().values() for p in part.parameters()]
-        torch._foreach_lerp_(average, recent, self.config.tau)
+        if average:
+            torch._foreach_lerp_(average, recent, self.config.tau)
 
     @with_torch_settings
     def draw(self, size: int) -> Draws:
@@ -311,14 +308,14 @@ class DDPG:
 
     # ----------------------------------------------------------------------------------------
 
-    def _policy(self, observation: Mapping[str, Tensor]) -> Any:
+    def _policy(self, observation: Mapping[str, Tensor], *, averaged: bool) -> Any:
         """What the actor makes of what it senses; what only the critic is told may be absent."""
         networks = self.networks
         sensed = {key: observation[key] for key in networks.senses}
         # As it is written: batches of acting come in sizes that would each have to be compiled.
         compiled = self.config.torch_compile == "yes"
         with torch.compiler.set_stance("force_eager") if compiled else nullcontext():
-            return networks.actor(networks.actor_latent(networks.encoders(sensed)))
+            return networks.policy(networks.encoders(sensed), averaged=averaged)
 
     def _actors_fusion(self) -> Iterator[nn.Parameter]:
         """The fusion that the actor's loss moves: its own, or by name the critic's too."""
@@ -334,7 +331,9 @@ class DDPG:
         return part
 
     def _averaged(self) -> dict[str, nn.Module]:
-        """What the target network is an average of."""
+        """What the target network is an average of; nothing, where the critic needs none."""
+        if self.config.critic_batch_norm:
+            return {}
         parts: dict[str, nn.Module] = {"critic": self.networks.critic}
         if self.config.target == "heads_and_fusion":
             parts["critic_fusion"] = self.networks.critic_fusion

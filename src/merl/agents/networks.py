@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
@@ -33,6 +36,8 @@ class Networks(nn.Module):
         critic: Q_phi1 and Q_phi2.
         actor_fusion: h_psi of the actor; None where it uses the critic's.
         actor: pi_theta.
+        policy_average: an average of the actor and its fusion, which acts in evaluation and
+            deployment; None where the newest weights do.
     """
 
     def __init__(
@@ -49,18 +54,43 @@ class Networks(nn.Module):
         self.critic = critic
         self.actor_fusion = actor_fusion
         self.actor = actor
+        self.policy_average: nn.ModuleDict | None = None
 
     @property
     def senses(self) -> tuple[str, ...]:
         """The keys that the actor acts on."""
-        return self._actors().modalities
+        return self._fusion_of_actor().modalities
 
     def actor_latent(self, encoded: Mapping[str, Tensor]) -> Tensor:
         """What the actor sees: the encodings, fused."""
-        latent: Tensor = self._actors()(encoded)
+        latent: Tensor = self._fusion_of_actor()(encoded)
         return latent
 
-    def _actors(self) -> Fusion | Concatenation:
+    def policy(self, encoded: Mapping[str, Tensor], *, averaged: bool = False) -> Any:
+        """What the actor makes of the encodings.
+
+        Args:
+            encoded: {key: (B, F_key)}.
+            averaged: use the average of its weights, where one is kept.
+        """
+        if averaged and self.policy_average is not None:
+            return self.policy_average["actor"](self.policy_average["fusion"](encoded))
+        return self.actor(self.actor_latent(encoded))
+
+    def start_average(self) -> None:
+        """Keep an average of the actor and its fusion from now on, equal to them so far."""
+        recent = nn.ModuleDict({"fusion": self._fusion_of_actor(), "actor": self.actor})
+        self.policy_average = copy.deepcopy(recent).requires_grad_(False)
+
+    @torch.no_grad()
+    def update_average(self, tau: float) -> None:
+        """Move the average towards the newest weights by the share `tau`."""
+        assert self.policy_average is not None
+        average: list[Tensor] = list(self.policy_average.parameters())
+        recent: list[Tensor] = [*self._fusion_of_actor().parameters(), *self.actor.parameters()]
+        torch._foreach_lerp_(average, recent, tau)
+
+    def _fusion_of_actor(self) -> Fusion | Concatenation:
         return self.critic_fusion if self.actor_fusion is None else self.actor_fusion
 
 
@@ -98,13 +128,16 @@ def make_networks(
     actor_fusion = None
     if config.fusion == "decoupled":
         actor_fusion = _fusion(config, senses, share)
-    size = HeadSize(config.head_layers, config.hidden_dim, config.head_norm)
-    critic = TwinCritic(critic_fusion.latent_dim, action_dim, size, _returns(config))
+    size = HeadSize(config.head_layers, config.hidden_dim, "layer" if config.head_norm else "none")
+    of_critic = dataclasses.replace(size, norm="batch") if config.critic_batch_norm else size
+    critic = TwinCritic(critic_fusion.latent_dim, action_dim, of_critic, _returns(config))
     policy = actor((actor_fusion or critic_fusion).latent_dim, action_dim, size)
     networks = Networks(encoders, critic_fusion, critic, actor_fusion, policy)
     orthogonal(networks)
     for head in (critic.q1, critic.q2):
         critic.returns.start_at_zero(head.output.bias)
+    if config.actor_average is not None:
+        networks.start_average()
     return networks
 
 

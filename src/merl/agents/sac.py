@@ -91,16 +91,18 @@ class SAC(DDPG):
     @torch.inference_mode()
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
         """tanh(u), u ~ N(mu, sigma^2) when exploring, else tanh(mu); see `DDPG.act`."""
-        mean, log_std = self._policy(observation)
+        mean, log_std = self._policy(observation, averaged=not explore)
         if not explore:
             return torch.tanh(mean)
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
         return torch.tanh(mean + log_std.exp() * noise)
 
-    def next_value(self, next_encoded: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """min_k Q_phi_k-bar(o_{t+n}, a) - alpha log pi(a | o_{t+n}) of an action a ~ pi, (B,)."""
+    def next_action(
+        self, next_encoded: Mapping[str, Tensor], noise: Tensor
+    ) -> tuple[Tensor, Tensor | float]:
+        """A ~ pi(o_{t+n}), (B, A), and -alpha log pi(a | o_{t+n}), (B,)."""
         action, log_prob, _ = self._sample(next_encoded, noise)
-        return self.target_q(next_encoded, action) - self.log_alpha.exp() * log_prob
+        return action, -self.log_alpha.exp() * log_prob
 
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
         """The actor towards actions of higher soft value; then alpha towards the target entropy."""

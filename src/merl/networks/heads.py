@@ -4,18 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
+Norm = Literal["layer", "batch", "none"]
+BATCH_MOMENTUM = 0.01
+"""Share by which BatchNorm's running statistics follow a batch's (CrossQ)."""
+
 
 class Hidden(nn.Module):
-    """Linear, LayerNorm (or none) and ReLU; the norm in the precision of the weights."""
+    """Linear, a norm (or none) and ReLU; the norm in the precision of the weights."""
 
-    def __init__(self, in_features: int, width: int, layer_norm: bool) -> None:
+    def __init__(self, in_features: int, width: int, norm: Norm) -> None:
         super().__init__()
         self.linear = nn.Linear(in_features, width)
-        self.norm = nn.LayerNorm(width) if layer_norm else nn.Identity()
+        self.norm: nn.Module = nn.Identity()
+        if norm == "layer":
+            self.norm = nn.LayerNorm(width)
+        elif norm == "batch":
+            self.norm = nn.BatchNorm1d(width, momentum=BATCH_MOMENTUM)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, in_features) to (B, width)."""
@@ -38,12 +47,12 @@ class HeadSize:
     Attributes:
         layers: linear layers, the output layer counted.
         width: of each hidden layer.
-        layer_norm: LayerNorm before each ReLU.
+        norm: before each ReLU: LayerNorm, BatchNorm or none.
     """
 
     layers: int
     width: int
-    layer_norm: bool = True
+    norm: Norm = "layer"
 
 
 class MLP(nn.Sequential):
@@ -51,7 +60,7 @@ class MLP(nn.Sequential):
 
     def __init__(self, in_features: int, out_features: int, size: HeadSize) -> None:
         widths = [in_features] + [size.width] * (size.layers - 1)
-        hidden = [Hidden(a, b, size.layer_norm) for a, b in pairwise(widths)]
+        hidden = [Hidden(a, b, size.norm) for a, b in pairwise(widths)]
         super().__init__(*hidden, Output(widths[-1], out_features))
 
     @property

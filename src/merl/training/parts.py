@@ -155,7 +155,8 @@ def bounded(agent: AgentConfig, discount: float) -> AgentConfig:
             "replay.discount 1 leaves returns without a bound, and agent.critic-loss "
             f"{agent.critic_loss} needs one: give --agent.critic-high"
         )
-    return dataclasses.replace(agent, critic_high=1.0 / (1.0 - discount))
+    high = round(1.0 / (1.0 - discount), 6)  # not 99.99999999999991
+    return dataclasses.replace(agent, critic_high=high)
 
 
 def choose_device(name: str) -> torch.device:

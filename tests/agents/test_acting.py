@@ -11,6 +11,7 @@ from bridge import Case, double, state_of, weather, weights_of
 
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
+from merl.core import MerlError
 
 CONFIG = MERLConfig(latent_dim=32, conv_channels=8, hidden_dim=32, precision="fp32")
 SEES = Case("sees", CONFIG)
@@ -109,3 +110,21 @@ def test_acting_leaves_no_graph_and_no_gradient() -> None:
     agent = SEES.agent()
     assert not acts(agent, SEES, explore=True).requires_grad
     assert all(p.grad is None for p in agent.networks.parameters())
+
+
+def test_correlated_noise_has_its_std_and_correlation_and_goes_on_after_a_save() -> None:
+    agent = with_mean(0.0, noise_correlation=0.8)
+    first, second = (acts(agent, FEELS, explore=True) for _ in range(2))
+    for noise in (first, second):
+        assert noise.std() == pytest.approx(0.2, rel=0.01)
+    together = torch.stack([first.flatten(), second.flatten()])
+    assert torch.corrcoef(together)[0, 1] == pytest.approx(0.8, abs=0.02)
+    resumed = with_mean(0.0, noise_correlation=0.8)
+    resumed.load_state_dict(agent.state_dict())
+    expected, found = (acts(each, FEELS, explore=True) for each in (agent, resumed))
+    assert torch.equal(expected, found)
+
+
+def test_a_correlation_of_one_is_refused() -> None:
+    with pytest.raises(MerlError, match=r"agent.noise-correlation must lie in \[0, 1\), not 1"):
+        replace(CONFIG, noise_correlation=1.0)

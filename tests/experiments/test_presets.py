@@ -40,6 +40,23 @@ def test_a_users_environment_is_not_moved_to_compare_unless_asked(preset: str) -
     assert not TrainConfig("my_robot:make").measure
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_of_a_users_environment_there_is_one_and_it_is_not_moved_at_random_for_long(
+    preset: str,
+) -> None:
+    config = compose(preset, "my_robot:make")
+    assert (config.num_envs, config.synchronous) == (1, True)
+    assert config.random_steps <= 5000
+    assert config.seed_steps <= 5000
+
+
+def test_preset_laptop_uses_both_cores_for_merls_own_tasks() -> None:
+    config = compose("laptop", "reach_duplo")
+    assert config.num_envs > 1
+    assert not config.synchronous
+    assert config.agent.fusion == "decoupled"
+
+
 @pytest.mark.parametrize(("task", "layers"), [("reach_duplo", 3), ("move_box", 6), ("lift_box", 6)])
 def test_the_heads_of_preset_paper_follow_the_task(task: str, layers: int) -> None:
     assert compose("paper", task).agent.head_layers == layers

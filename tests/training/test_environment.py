@@ -13,7 +13,7 @@ import pytest
 from merl.agents import AGENTS
 from merl.core import EnvironmentFailed, MerlError
 from merl.envs.config import EnvConfig
-from merl.training.config import TrainConfig
+from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.environment import make_run_env, run_spaces
 from merl.training.plain import from_plain, to_plain
 from merl.training.resuming import taken_up
@@ -164,3 +164,33 @@ def test_signal_handlers_are_put_back_after_every_call(monkeypatch: pytest.Monke
             assert signal.getsignal(signal.SIGINT) is before
     finally:
         signal.signal(signal.SIGINT, mine)
+
+
+def test_evaluations_start_where_they_are_asked_to() -> None:
+    trained = TrainConfig(
+        "move_box",
+        agent_name="merl_state",
+        agent=AGENTS["merl_state"],
+        env=dataclasses.replace(SMALL, start=("around", "holding")),
+    )
+    assert trained.evaluated == trained
+    config = dataclasses.replace(trained, eval=EvaluationConfig(start=("above",)))
+    assert config.evaluated.env == dataclasses.replace(trained.env, start=("above",))
+    assert from_plain(EvaluationConfig, to_plain(config)["eval"]) == config.eval
+    heights = {}
+    for name, each in (("trained", config), ("evaluated", config.evaluated)):
+        env = make_run_env(each)
+        try:
+            env.reset(seed=0)
+            inner: Any = env.unwrapped
+            heights[name] = inner.task.tool_center_point(inner.physics)[2]
+        finally:
+            env.close()
+    assert heights["trained"] < 0.15 < heights["evaluated"]
+
+
+def test_starts_of_evaluations_are_refused_where_there_are_none() -> None:
+    with pytest.raises(MerlError, match=r"eval\.start is for merl's own tasks: my_env:make decides"):
+        TrainConfig("my_env:make", eval=EvaluationConfig(start=("above",)))
+    with pytest.raises(MerlError, match="start"):
+        TrainConfig("move_box", eval=EvaluationConfig(start=()))

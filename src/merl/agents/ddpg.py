@@ -122,8 +122,8 @@ class DDPG:
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
         correlation = self.config.noise_correlation
         if correlation:
-            last = self.acting_noise if self.acting_noise is not None else noise
-            noise = correlation * last + (1 - correlation**2) ** 0.5 * noise
+            if self.acting_noise is not None:
+                noise = correlation * self.acting_noise + (1 - correlation**2) ** 0.5 * noise
             self.acting_noise = noise
         return (mean + self.config.noise(self.step) * noise).clamp(-1.0, 1.0)
 

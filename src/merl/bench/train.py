@@ -48,7 +48,7 @@ def run(
 
     Args:
         repeats: how many rounds, in each of which every side has its turn.
-        steps: environment steps of a turn; if not set, 60, on a GPU 2000.
+        steps: environment steps of a turn; if not set, 400, on a GPU 2000.
         task: what is trained on.
         preset: whose values; if not set, laptop's, on a GPU paper's.
 
@@ -57,7 +57,7 @@ def run(
         and `high` over the rounds; `precision`, `threads` and `updates_per_step`.
     """
     on_gpu = torch.cuda.is_available()
-    steps = steps or (2000 if on_gpu else 60)
+    steps = steps or (2000 if on_gpu else 400)
     preset = preset or ("paper" if on_gpu else "laptop")
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "task": task, "preset": preset}
     result |= circumstances()
@@ -129,10 +129,10 @@ def table(result: dict[str, Any]) -> Table:
 
 def _sides() -> dict[str, dict[str, Any]]:
     """The ways to run the loop, by what they are called."""
-    several = max(2, len(os.sched_getaffinity(0)) - 1)
+    several = max(4, len(os.sched_getaffinity(0)) - 1)
     return {
-        STRICT: {},
-        "one environment, beside the learner": {"synchronous": False},
+        STRICT: {"synchronous": True, "num_envs": 1},
+        "one environment, beside the learner": {"synchronous": False, "num_envs": 1},
         f"{several} environments, beside the learner": {
             "synchronous": False,
             "num_envs": several,

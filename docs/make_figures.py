@@ -3,7 +3,6 @@
 import csv
 import json
 from pathlib import Path
-from statistics import mean
 
 import numpy as np
 
@@ -28,8 +27,6 @@ def main() -> None:
     small_tasks()
     for file in sorted(AGENTS.glob("*-evaluation.json")):
         print(evaluated(file))
-    for seed in range(3):
-        print(f"seed {seed}: {mean_return(f'laptop-seed{seed}'):.1f}")
 
 
 def evaluated(file: Path) -> str:
@@ -47,11 +44,11 @@ def evaluated(file: Path) -> str:
 
 
 def laptop() -> None:
-    """An hour of preset laptop."""
+    """Preset laptop by the clock."""
     lines = {row.name: row.returns.mean for row in references("reach_duplo")}
     lines.pop("no motion")
     learning_curves(
-        {"MERL, preset laptop": sorted(DATA.glob("laptop-seed?.csv"))},
+        {"MERL, preset laptop": sorted((DOCS / "speedrun/data").glob("laptop-10-s?.csv"))},
         IMAGES / "laptop.png",
         x="minutes",
         references=lines,
@@ -114,12 +111,6 @@ def small_tasks() -> None:
         references={"straight to the mark": optimum(SPLIT), "standing still": float(still)},
         title="the camera sees the mark, the joints know the dot",
     )
-
-
-def mean_return(name: str) -> float:
-    """Of the episodes in `data/NAME-evaluation.json`."""
-    told = json.loads((DATA / f"{name}-evaluation.json").read_text())
-    return mean(episode["return"] for episode in told["episodes"])
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from merl.core import EnvironmentFailed, MerlError
 from merl.envs.config import EnvConfig
 from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.environment import make_run_env, run_spaces
+from merl.training.parts import Parts
 from merl.training.plain import from_plain, to_plain
 from merl.training.resuming import taken_up
 from toy import DotEnv
@@ -194,3 +195,21 @@ def test_starts_of_evaluations_are_refused_where_there_are_none() -> None:
         TrainConfig("my_env:make", eval=EvaluationConfig(start=("above",)))
     with pytest.raises(MerlError, match="start"):
         TrainConfig("move_box", eval=EvaluationConfig(start=()))
+
+
+def test_a_run_evaluates_in_the_environment_that_its_evaluations_start_in(tmp_path: Path) -> None:
+    config = TrainConfig(
+        "move_box",
+        agent_name="merl_state",
+        agent=dataclasses.replace(AGENTS["merl_state"], precision="fp32", hidden_dim=16),
+        env=dataclasses.replace(SMALL, start=("around",)),
+        eval=EvaluationConfig(start=("above",), video="none"),
+        steps=300,
+        threads=1,
+        run_dir=tmp_path / "run",
+    )
+    with Parts.prepare(config, new=True) as parts:
+        trained: Any = parts.env.unwrapped
+        assert parts.eval_env is not None
+        evaluated: Any = parts.eval_env.unwrapped
+        assert (trained.config.start, evaluated.config.start) == (("around",), ("above",))

@@ -66,15 +66,10 @@ class Case:
             clip=c.noise_clip,
             tau=c.tau,
             learning_rate=c.learning_rate,
-            encoder_rate=c.encoder_learning_rate or c.learning_rate,
-            actor_rate=c.actor_learning_rate or c.learning_rate,
-            beta_1=c.adam_beta1,
             averaged=(*fusion, "phi_1", "phi_2"),
-            reward_scale=c.reward_scale,
-            penalty=c.saturation_penalty,
             bins=c.critic_bins if c.critic_loss == "hl_gauss" else 0,
-            low=c.reward_scale * c.critic_low,
-            high=c.reward_scale * (100.0 if c.critic_high is None else c.critic_high),
+            low=c.critic_low,
+            high=100.0 if c.critic_high is None else c.critic_high,
         )
 
     def agent(self, seed: int = 0, actions: int = ACTIONS) -> DDPG:

@@ -50,13 +50,8 @@ class Spec:
     clip: float = 0.3
     tau: float = 0.01
     learning_rate: float = 1e-4
-    encoder_rate: float = 1e-4
-    actor_rate: float = 1e-4
-    beta_1: float = 0.9
-    reward_scale: float = 1.0
-    penalty: float = 0.0  # of the actor's outputs before the tanh, beyond 1
     bins: int = 0  # of a critic that learns a histogram (HL-Gauss); 0: the squared error
-    low: float = 0.0  # bounds of the targets, scaled
+    low: float = 0.0  # bounds of the targets
     high: float = 100.0
     averaged: tuple[str, ...] = ("phi_1", "phi_2")  # with "psi_critic" in front: DrQ-v2's target
 
@@ -267,7 +262,7 @@ def target(w: Weights, sample: Sample, chance: Chance, spec: Spec) -> Tensor:
     q_next = torch.minimum(
         q(w, "bar_phi_1", r_mm_next, a_next, spec), q(w, "bar_phi_2", r_mm_next, a_next, spec)
     )
-    return spec.reward_scale * sample.r + sample.discount * q_next
+    return sample.r + sample.discount * q_next
 
 
 def critic_loss(w: Weights, r: Modalities, a: Tensor, y: Tensor, spec: Spec) -> Tensor:
@@ -285,15 +280,7 @@ def actor_loss(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> Tensor:
     """Equation 2; what the critic sees of o_t is a constant, also where its fusion learns here."""
     a = pi(w, h(w, "psi_actor", r, spec), noise, spec)
     r_mm = h(w, "psi_critic", r, spec).detach()
-    u = mlp(w, "theta", h(w, "psi_actor", r, spec), spec)
-    least = torch.minimum(q(w, "phi_1", r_mm, a, spec), q(w, "phi_2", r_mm, a, spec))
-    return penalty(u, spec) - least.mean()
-
-
-def penalty(u: Tensor, spec: Spec) -> Tensor:
-    """Of outputs before the tanh, (B, A), by how far they are beyond 1."""
-    excess = torch.where(u.abs() > 1, u.abs() - 1, torch.zeros_like(u))
-    return spec.penalty * (excess**2).mean()
+    return -torch.minimum(q(w, "phi_1", r_mm, a, spec), q(w, "phi_2", r_mm, a, spec)).mean()
 
 
 # -- algorithm 1 ---------------------------------------------------------------------------------
@@ -320,22 +307,14 @@ def gradients(loss: Callable[[Weights], Tensor], w: Weights, names: list[str]) -
     )
 
 
-def rate(name: str, spec: Spec) -> float:
-    """The step size of a weight."""
-    symbol = name.split(".")[0]
-    if symbol in ("xi", "zeta"):
-        return spec.encoder_rate
-    return spec.actor_rate if symbol in ACTOR_LEARNS else spec.learning_rate
-
-
 def adam(w: Weights, moments: Moments, g: Weights, spec: Spec) -> tuple[Weights, Moments]:
-    """Kingma & Ba (2015), algorithm 1, with their defaults but for beta_1."""
-    beta_1, beta_2, eps, t = spec.beta_1, 0.999, 1e-8, moments.t + 1
+    """Kingma & Ba (2015), algorithm 1, with their defaults."""
+    beta_1, beta_2, eps, t = 0.9, 0.999, 1e-8, moments.t + 1
     m = {name: beta_1 * moments.m[name] + (1 - beta_1) * g[name] for name in g}
     v = {name: beta_2 * moments.v[name] + (1 - beta_2) * g[name] ** 2 for name in g}
     moved = {
         name: w[name]
-        - rate(name, spec)
+        - spec.learning_rate
         * (m[name] / (1 - beta_1**t))
         / ((v[name] / (1 - beta_2**t)).sqrt() + eps)
         for name in g

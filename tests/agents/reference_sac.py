@@ -29,7 +29,6 @@ from reference import (
     h,
     mlp,
     of,
-    penalty,
     q,
     tanh,
 )
@@ -83,7 +82,7 @@ def update(
     soft = torch.minimum(
         q(w, "bar_phi_1", latent_next, a_next, spec), q(w, "bar_phi_2", latent_next, a_next, spec)
     )
-    y = (spec.reward_scale * sample.r + sample.discount * (soft - alpha * log_pi_next)).detach()
+    y = (sample.r + sample.discount * (soft - alpha * log_pi_next)).detach()
     features = encode(w, sample.o, chance.shift, spec)
 
     def eq_5(w: Weights) -> Tensor:
@@ -97,8 +96,7 @@ def update(
         a, log_pi = policy(w, features, chance.noise, spec)
         latent = h(w, "psi_critic", features, spec).detach()
         least = torch.minimum(q(w, "phi_1", latent, a, spec), q(w, "phi_2", latent, a, spec))
-        out = mlp(w, "theta", h(w, "psi_actor", features, spec), spec)
-        return (alpha * log_pi - least).mean() + penalty(out[:, : out.shape[-1] // 2], spec)
+        return (alpha * log_pi - least).mean()
 
     loss_2, g_2 = eq_9(w), gradients(eq_9, w, of(w, ("psi_actor", "theta")))
     log_pi = policy(w, features, chance.noise, spec)[1]

@@ -107,10 +107,6 @@ def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str
     [
         ("learning_rate", 0.0),
         ("learning_rate", float("nan")),
-        ("encoder_learning_rate", 0.0),
-        ("actor_learning_rate", float("inf")),
-        ("adam_beta1", 1.0),
-        ("saturation_penalty", -1.0),
         ("actor_average", 0.0),
         ("tau", 0.0),
         ("tau", 1.01),

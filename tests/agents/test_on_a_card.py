@@ -51,8 +51,7 @@ def draws(size: int) -> Draws:
         ("merl", {}),
         ("drqv2", {}),
         ("merl", {"critic_loss": "hl_gauss"}),
-        ("merl", {"critic_batch_norm": True}),
-        ("merl", {"actor_average": 0.1, "saturation_penalty": 1.0, "reward_scale": 2.0}),
+        ("merl", {"actor_average": 0.1}),
     ],
 )
 def test_an_update_asks_the_host_nothing(

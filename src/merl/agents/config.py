@@ -33,13 +33,7 @@ class AgentConfig:
     critic_vectors: tuple[str, ...] = ()
     """Vector keys that the critic alone is told, e.g. `state`: what is known in training only."""
     learning_rate: float = 1e-4
-    """Adam's step size, for every network that has none of its own."""
-    encoder_learning_rate: float | None = None
-    """Adam's step size for the encoders; `learning_rate`, if not set."""
-    actor_learning_rate: float | None = None
-    """Adam's step size for the actor and its fusion; `learning_rate`, if not set."""
-    adam_beta1: float = 0.9
-    """Decay of Adam's mean of the gradients, in [0, 1); every network's."""
+    """Adam's step size, for every network."""
     critic_loss: CriticLoss = "mse"
     """How the critic learns its target: by the mean squared error, or as a histogram over bins by
     cross-entropy (hl_gauss; Farebrother et al. 2024)."""
@@ -51,13 +45,6 @@ class AgentConfig:
     critic_high: float | None = None
     """The highest; if not set, 1 / (1 - discount), which no return exceeds as long as rewards lie
     in [0, 1]. Higher targets count as this one: with rewards above 1 set it."""
-    critic_batch_norm: bool = False
-    """BatchNorm in the critic's hidden layers, in place of `head_norm`'s (CrossQ, Bhatt et al.
-    2024): one pass over (o, a) and (o', a') gives the values and the target, without a target
-    network; the actor's loss uses running statistics."""
-    reward_scale: float = 1.0
-    """Factor of the rewards that the critic learns from; metrics of Q stay in the environment's
-    unit, losses do not."""
     actor_every: int = 1
     """The actor learns in every n-th update only (delayed policy updates, TD3); critic, encoders
     and target learn in all."""
@@ -65,9 +52,6 @@ class AgentConfig:
     """Evaluate and deploy an exponential moving average of the actor and its fusion, which moves by
     this share towards the newest weights whenever the actor learns, in (0, 1], e.g. 0.001; if not
     set, the newest weights. Exploration and updates always use the newest."""
-    saturation_penalty: float = 0.0
-    """Weight of mean(max(|u| - 1, 0)^2) in the actor's loss, with u its output before the tanh: it
-    keeps actions from the ends of their range, where the tanh has no gradient."""
     tau: float = 0.01
     """How far the target network moves towards the critic at each update, in (0, 1]."""
     noise_std: float = 0.2
@@ -119,10 +103,8 @@ class AgentConfig:
     which tries it once on a GPU, for a run that takes long, and keeps it where it is faster."""
 
     def __post_init__(self) -> None:
-        rates = ("learning_rate", "encoder_learning_rate", "actor_learning_rate")
-        for name, value in self._given(*rates, "reward_scale"):
-            if not 0 < value < math.inf:
-                raise MerlError(f"agent.{_flag(name)} must be above 0, not {value}")
+        if not 0 < self.learning_rate < math.inf:
+            raise MerlError(f"agent.learning-rate must be above 0, not {self.learning_rate}")
         for name, choice, choices in (
             ("precision", self.precision, get_args(Precision)),
             ("target", self.target, get_args(Target)),
@@ -132,12 +114,10 @@ class AgentConfig:
             ("torch-compile", self.torch_compile, get_args(TorchCompile)),
         ):
             check_choice(f"agent.{name}", choice, choices)
-        if not 0 <= self.adam_beta1 < 1:
-            raise MerlError(f"agent.adam-beta1 must lie in [0, 1), not {self.adam_beta1}")
         for name, value in self._given("tau", "actor_average"):
             if not 0 < value <= 1:
                 raise MerlError(f"agent.{_flag(name)} must lie in (0, 1], not {value}")
-        for name, value in self._given("noise_std", "noise_std_end", "saturation_penalty"):
+        for name, value in self._given("noise_std", "noise_std_end"):
             if not 0 <= value < math.inf:
                 raise MerlError(f"agent.{_flag(name)} must be at least 0, not {value}")
         if not 0 <= self.noise_correlation < 1:
@@ -156,10 +136,6 @@ class AgentConfig:
                     f"agent.{_flag(name)} must be at least {bound} and at most {most}, "
                     f"not {getattr(self, name)}"
                 )
-        if self.critic_batch_norm and self.head_layers == 1:
-            raise MerlError(
-                "agent.critic-batch-norm needs a hidden layer: use at least 2 agent.head-layers"
-            )
         self._check_histogram()
         for name in ("fusion", "fusion_norm", "squash"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from merl.agents.compiling import compile_parts
 from merl.agents.config import AgentConfig
 from merl.agents.draws import Draws
-from merl.agents.gradients import clamp_straight_through, frozen, judging
+from merl.agents.gradients import clamp_straight_through, frozen
 from merl.agents.networks import Networks
 from merl.agents.optimizers import adam, load_optimizer, step_optimizer
 from merl.core import Batch, Copies
@@ -79,17 +79,11 @@ class DDPG:
         self.networks = networks.to(device)
         # The target fuses with the most recent weights unless its config averages them too.
         self.critic_target = nn.ModuleDict(copy.deepcopy(self._averaged())).requires_grad_(False)
-        encoders = [*networks.encoders.parameters()]
-        critic = [*networks.critic_fusion.parameters(), *networks.critic.parameters()]
-        self.critic_parameters = encoders + critic
+        parts = networks.encoders, networks.critic_fusion, networks.critic
+        self.critic_parameters = [parameter for part in parts for parameter in part.parameters()]
         self.actor_parameters = [*self._actors_fusion(), *networks.actor.parameters()]
-        if config.encoder_learning_rate is None:
-            self.critic_optimizer = self._adam(self.critic_parameters)
-        else:
-            self.critic_optimizer = self._adam(critic)
-            group = {"params": encoders, "lr": config.encoder_learning_rate}
-            self.critic_optimizer.add_param_group(group)
-        self.actor_optimizer = self._adam(self.actor_parameters, config.actor_learning_rate)
+        self.critic_optimizer = self._adam(self.critic_parameters)
+        self.actor_optimizer = self._adam(self.actor_parameters)
         if config.torch_compile == "yes":
             compile_parts(self.networks, self.critic_target, self.device)
         words = np.random.SeedSequence(seed).generate_state(2)
@@ -170,28 +164,19 @@ class DDPG:
         # Apart: autocast would hand weights that it cast without a gradient to what needs one.
         with self._arithmetic(), torch.no_grad():
             next_action, bonus = self.next_action(next_encoded, next_noise)
-            if self.config.critic_batch_norm:
-                next_latent = networks.critic_fusion(next_encoded)
-            else:
-                next_q = self.target_q(next_encoded, next_action)
+            next_q = self.target_q(next_encoded, next_action)
         with self._arithmetic():
             latent = networks.critic_fusion(encoded)  # (B, d)
-            if self.config.critic_batch_norm:
-                joint = latent, batch.action, next_latent, next_action
-                first, second, next_q = networks.critic.joint(*joint)
-            else:
-                first, second = networks.critic(latent, batch.action)
-        reward = self.config.reward_scale * batch.reward
-        y = reward + batch.discount * (next_q + bonus)  # (B,)
+            first, second = networks.critic(latent, batch.action)
+        y = batch.reward + batch.discount * (next_q + bonus)  # (B,)
         loss = networks.critic.returns.loss(first, second, y)
         step_optimizer(self.critic_optimizer, loss, self.critic_parameters)
         q1, q2 = (networks.critic.returns.value(output.detach()) for output in (first, second))
-        unit = self.config.reward_scale  # values are reported in the unit of the rewards
         return {
             "critic_loss": loss.detach(),
-            "q": q1.mean() / unit,
-            "q_gap": (q1 - q2).abs().mean() / unit,
-            "target_q": y.mean() / unit,
+            "q": q1.mean(),
+            "q_gap": (q1 - q2).abs().mean(),
+            "target_q": y.mean(),
             "reward": batch.reward.mean(),
         }
 
@@ -213,26 +198,19 @@ class DDPG:
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
         """Eq. 2: the actor and its fusion towards actions of higher value; nothing else moves."""
         with self._arithmetic():
-            u = self.networks.actor(self.networks.actor_latent(encoded), tanh=False)  # (B, A)
-            mean = torch.tanh(u)
+            mean = self.networks.actor(self.networks.actor_latent(encoded))  # (B, A)
             loss = -self.q(encoded, clamp_straight_through(mean + noise)).mean()
-            loss = self.with_penalty(loss, u)
         step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         return {
             "actor_loss": loss.detach(),
             "action_saturation": (mean.detach().abs() > 0.95).float().mean(),
         }
 
-    def with_penalty(self, loss: Tensor, u: Tensor) -> Tensor:
-        """The actor's loss, and the price of outputs u (B, A) that lie deep in the tanh's ends."""
-        price = self.config.saturation_penalty
-        return loss + price * torch.relu(u.abs() - 1).square().mean() if price else loss
-
     def q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
         """min_k Q_phi_k(o_t, a), (B,), as a function of the action alone."""
         with torch.no_grad():
             latent = self.networks.critic_fusion(encoded)
-        with frozen(self.networks.critic), judging(self.networks.critic):
+        with frozen(self.networks.critic):
             q1, q2 = self.networks.critic.values(latent, action)
         return torch.minimum(q1, q2)
 
@@ -241,8 +219,7 @@ class DDPG:
         """phi_bar <- (1 - tau) phi_bar + tau phi."""
         average: list[Tensor] = list(self.critic_target.parameters())
         recent: list[Tensor] = [p for part in self._averaged().values() for p in part.parameters()]
-        if average:
-            torch._foreach_lerp_(average, recent, self.config.tau)
+        torch._foreach_lerp_(average, recent, self.config.tau)
 
     @with_torch_settings
     def draw(self, size: int) -> Draws:
@@ -331,9 +308,7 @@ class DDPG:
         return part
 
     def _averaged(self) -> dict[str, nn.Module]:
-        """What the target network is an average of; nothing, where the critic needs none."""
-        if self.config.critic_batch_norm:
-            return {}
+        """What the target network is an average of."""
         parts: dict[str, nn.Module] = {"critic": self.networks.critic}
         if self.config.target == "heads_and_fusion":
             parts["critic_fusion"] = self.networks.critic_fusion
@@ -344,11 +319,7 @@ class DDPG:
         enabled = self.config.precision == "bf16"
         return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled)
 
-    def _adam(self, parameters: Sequence[Tensor], rate: float | None = None) -> torch.optim.Adam:
-        """Adam over these parameters; with the config's rate, if none is given."""
-        return adam(
-            parameters,
-            self.config.learning_rate if rate is None else rate,
-            self.config.adam_beta1,
-            capturable=self.device.type == "cuda",  # its graphs read the step from the device
-        )
+    def _adam(self, parameters: Sequence[Tensor]) -> torch.optim.Adam:
+        """Adam over these parameters, with the config's step size."""
+        on_a_card = self.device.type == "cuda"  # its graphs read the step from the device
+        return adam(parameters, self.config.learning_rate, capturable=on_a_card)

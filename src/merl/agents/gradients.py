@@ -21,19 +21,6 @@ def frozen(module: nn.Module) -> Iterator[None]:
             weight.requires_grad_(True)
 
 
-@contextmanager
-def judging(module: nn.Module) -> Iterator[None]:
-    """BatchNorm uses its running statistics and leaves them as they are."""
-    norms = [part for part in module.modules() if isinstance(part, nn.BatchNorm1d)]
-    for norm in norms:
-        norm.eval()
-    try:
-        yield
-    finally:
-        for norm in norms:
-            norm.train()
-
-
 def clamp_straight_through(action: Tensor) -> Tensor:
     """The action in [-1, 1], with the gradient as if it had not been clamped."""
     return action + (action.clamp(-1.0, 1.0) - action).detach()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -129,8 +128,7 @@ def make_networks(
     if config.fusion == "decoupled":
         actor_fusion = _fusion(config, senses, share)
     size = HeadSize(config.head_layers, config.hidden_dim, "layer" if config.head_norm else "none")
-    of_critic = dataclasses.replace(size, norm="batch") if config.critic_batch_norm else size
-    critic = TwinCritic(critic_fusion.latent_dim, action_dim, of_critic, _returns(config))
+    critic = TwinCritic(critic_fusion.latent_dim, action_dim, size, _returns(config))
     policy = actor((actor_fusion or critic_fusion).latent_dim, action_dim, size)
     networks = Networks(encoders, critic_fusion, critic, actor_fusion, policy)
     orthogonal(networks)
@@ -209,12 +207,11 @@ def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
 
 
 def _returns(config: AgentConfig) -> Returns:
-    """The form of the critic's output, in the unit of the scaled rewards."""
+    """The form of the critic's output."""
     if config.critic_loss == "mse":
         return Scalar()
     high = DEFAULT_HIGH if config.critic_high is None else config.critic_high
-    scale = config.reward_scale
-    return HLGauss(scale * config.critic_low, scale * high, config.critic_bins)
+    return HLGauss(config.critic_low, high, config.critic_bins)
 
 
 def _fusion(config: AgentConfig, features: Mapping[str, int], share: int) -> Fusion | Concatenation:

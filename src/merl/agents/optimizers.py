@@ -9,20 +9,15 @@ import torch
 from torch import Tensor
 
 
-def adam(
-    parameters: Sequence[Tensor], rate: float, beta1: float, *, capturable: bool
-) -> torch.optim.Adam:
+def adam(parameters: Sequence[Tensor], rate: float, *, capturable: bool) -> torch.optim.Adam:
     """Make Adam over these parameters.
 
     Args:
         parameters: to learn.
         rate: step size.
-        beta1: decay of the mean of the gradients.
         capturable: whether a CUDA graph can hold its step.
     """
-    return torch.optim.Adam(
-        parameters, lr=rate, betas=(beta1, 0.999), fused=True, capturable=capturable
-    )
+    return torch.optim.Adam(parameters, lr=rate, fused=True, capturable=capturable)
 
 
 def step_optimizer(

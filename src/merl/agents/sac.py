@@ -110,7 +110,7 @@ class SAC(DDPG):
             action, log_prob, mean = self._sample(encoded, noise)
             q = self.q(encoded, action)
         alpha = self.log_alpha.exp().detach()
-        loss = self.with_penalty((alpha * log_prob - q).mean(), mean)
+        loss = (alpha * log_prob - q).mean()
         step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         entropy = -log_prob.detach().mean()
         target = self.config.target_entropy

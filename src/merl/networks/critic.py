@@ -30,7 +30,6 @@ class TwinCritic(nn.Module):
     ) -> None:
         super().__init__()
         self.returns = returns or Scalar()
-        self.batch_norm = size.norm == "batch"
         outputs = self.returns.outputs
         self.q1, self.q2 = (MLP(latent_dim + action_dim, outputs, size) for _ in range(2))
 
@@ -38,26 +37,11 @@ class TwinCritic(nn.Module):
         """Latent (B, d) and action (B, A) to an output of each head: (B,), or logits (B, bins)."""
         both = torch.cat([latent, action], dim=-1)
         at_once = both.is_cuda if self.at_once is None else self.at_once
-        if at_once and not self.batch_norm:
+        if at_once:
             q1, q2 = twins(self.q1, self.q2, both)
         else:
             q1, q2 = self.q1(both), self.q2(both)
         return q1.squeeze(-1), q2.squeeze(-1)
-
-    def joint(
-        self, latent: Tensor, action: Tensor, next_latent: Tensor, next_action: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """One pass over (o, a) and (o', a'), which share the statistics of BatchNorm (CrossQ).
-
-        Returns:
-            The output of each head for (o, a), and the lesser value of (o', a'), (B,), detached.
-        """
-        outputs = self(torch.cat([latent, next_latent]), torch.cat([action, next_action]))
-        (first, next_first), (second, next_second) = (output.chunk(2) for output in outputs)
-        with torch.no_grad():
-            value = self.returns.value
-            next_q = torch.minimum(value(next_first), value(next_second))
-        return first, second, next_q
 
     def values(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Latent (B, d) and action (B, A) to the two values, (B,) each."""

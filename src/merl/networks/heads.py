@@ -9,9 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-Norm = Literal["layer", "batch", "none"]
-BATCH_MOMENTUM = 0.01
-"""Share by which BatchNorm's running statistics follow a batch's (CrossQ)."""
+Norm = Literal["layer", "none"]
 
 
 class Hidden(nn.Module):
@@ -23,8 +21,6 @@ class Hidden(nn.Module):
         self.norm: nn.Module = nn.Identity()
         if norm == "layer":
             self.norm = nn.LayerNorm(width)
-        elif norm == "batch":
-            self.norm = nn.BatchNorm1d(width, momentum=BATCH_MOMENTUM)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, in_features) to (B, width)."""
@@ -47,7 +43,7 @@ class HeadSize:
     Attributes:
         layers: linear layers, the output layer counted.
         width: of each hidden layer.
-        norm: before each ReLU: LayerNorm, BatchNorm or none.
+        norm: before each ReLU: LayerNorm or none.
     """
 
     layers: int
@@ -84,10 +80,9 @@ class Actor(nn.Module):
         self.action_dim = action_dim
         self.layers = MLP(latent_dim, action_dim, size)
 
-    def forward(self, latent: Tensor, *, tanh: bool = True) -> Tensor:
-        """(B, d) to (B, A), in (-1, 1); without the last tanh, unbounded."""
-        u: Tensor = self.layers(latent)
-        return torch.tanh(u) if tanh else u
+    def forward(self, latent: Tensor) -> Tensor:
+        """(B, d) to (B, A), in (-1, 1)."""
+        return torch.tanh(self.layers(latent))
 
 
 class GaussianActor(nn.Module):

@@ -63,6 +63,7 @@ PRESETS: dict[str, Preset] = {
             "conv_strides": (2, 2, 1),
             "shift_pad": 1,
             "hidden_dim": 256,
+            "actor_average": 0.001,
         },
         own_env={
             "steps": 150_000,

@@ -246,6 +246,31 @@ def test_the_hand_can_start_with_the_box_in_it(name):
     assert np.mean(follows) >= 0.8
 
 
+@pytest.mark.parametrize("name", BOX_TASKS)
+def test_the_hand_can_start_with_the_box_on_its_way_to_the_target(name):
+    """Anywhere on the straight way, also at its ends, and there it is held."""
+    episodes, above = Episodes(name, starts=("carrying",)), Episodes(name)
+    task, shares, held = episodes.task, [], []
+    for seed in range(30):
+        lay = above.task.prop_position(above.start(seed))
+        physics = episodes.start(seed)
+        way, gone = task.target - lay, task.prop_position(physics) - lay
+        shares.append(gone @ way / (way @ way))
+        np.testing.assert_allclose(gone, shares[-1] * way, atol=2e-3)
+        assert task.hand_distance(physics) < 0.03
+        assert task.tilt_cosine(physics) > 0.99
+        control = np.zeros(physics.model.nu)
+        control[-3:] = GRIP
+        for _ in range(25):
+            physics.set_control(control)
+            physics.step(task.physics_steps_per_control_step)
+        held.append(np.linalg.norm(task.prop_position(physics) - lay - gone) < 0.03)
+    assert min(shares) > -0.01
+    assert max(shares) < 1.01
+    assert np.std(shares) == pytest.approx(12**-0.5, rel=0.3)
+    assert np.mean(held) >= 0.6
+
+
 def test_a_box_slides_on_the_floor_with_a_friction_of_one():
     """At 0.5 m/s it comes to rest after v^2 / (2 mu g)."""
     episodes, speed, friction = Episodes("move_box"), 0.5, 1.0

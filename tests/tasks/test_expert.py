@@ -7,7 +7,7 @@ from episodes import Episodes
 from merl.tasks.expert import Expert
 from merl.tasks.jaco import EPISODE_STEPS
 
-AT_BOX = {"starts": ("around", "holding")}
+AT_BOX = {"starts": ("around", "holding", "carrying")}
 TASKS = [
     pytest.param("reach_duplo", {}, id="reach_duplo"),
     pytest.param("move_box", {}, id="move_box"),

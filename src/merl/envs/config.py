@@ -15,7 +15,7 @@ where both were measured (docs/bench.md). It does not depend on the machine, so 
 the same images everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
-StartName = Literal["above", "around", "holding"]
+StartName = Literal["above", "around", "holding", "carrying"]
 RewardName = Literal["paper", "staged"]
 ImageLayout = Literal["auto", "hwc", "chw"]
 OBSERVATIONS = ("image", "proprio", "state")
@@ -65,8 +65,9 @@ class EnvConfig:
 
     start: tuple[StartName, ...] = ("above",)
     """Where the hand starts: `above` (20 to 40 cm over the floor) or, for `move_box` and
-    `lift_box`, `around` (its open fingers around the box) or `holding` (closed around it). Of
-    several, one is drawn in each episode."""
+    `lift_box`, `around` (its open fingers around the box), `holding` (closed around it) or
+    `carrying` (closed around it, anywhere on the way to the target). Of several, one is drawn in
+    each episode."""
 
     reward: RewardName = "paper"
     """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5) or `staged` (the authors' later

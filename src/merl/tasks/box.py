@@ -35,8 +35,9 @@ CLOSING_VELOCITY = 1.0
 """Of the fingers that close around the box before an episode begins, rad/s."""
 CLOSING_STEPS = 20
 """For so many control steps: enough from the widest start."""
-HandStart = Literal["above", "around", "holding"]
-"""Where the hand starts: above the workspace, open around the box, or closed around it."""
+HandStart = Literal["above", "around", "holding", "carrying"]
+"""Where the hand starts: above the workspace, open around the box, closed around it, or closed
+around it on its way to the target."""
 ABOVE: tuple[HandStart, ...] = ("above",)
 """dm_control's start, that of every `JacoTask`."""
 _RED = (1.0, 0.0, 0.0, 1.0)
@@ -49,7 +50,8 @@ class BoxTask(JacoTask):
     The start `above` is that of `JacoTask`. In `around` the hand is then moved to the box, to a
     place drawn from `AROUND_BOX` and with its fingers closed by a share of `CLOSED_AROUND_BOX`,
     where it touches nothing; should none be found, which is rare, it stays where it was. In
-    `holding` the fingers have closed from there, and hold the box, which is on the floor.
+    `holding` the fingers have closed from there, and hold the box, which is on the floor. In
+    `carrying` they hold it anywhere on the straight way from there to its target, ends included.
 
     Args:
         occluded: put a disc between camera and box.
@@ -102,12 +104,22 @@ class BoxTask(JacoTask):
         start = self._starts[random_state.randint(len(self._starts))]
         if start == "above":
             return
-        if self._place_hand_around_box(physics, random_state) and start == "holding":
-            self._close_fingers(physics)
+        box = physics.bind(self._prop_frame.freejoint)
+        pose = np.array(box.qpos)
+        if start == "carrying":
+            assert self.target is not None
+            way = self.target - pose[:3]
+            box.qpos = [*(pose[:3] + random_state.uniform() * way), *pose[3:]]
+            physics.forward()
+        if not self._place_hand_around_box(physics, random_state):
+            box.qpos = pose
+        elif start != "around":
+            self._close_fingers(physics, box_is_fixed=start == "carrying")
 
     def _place_hand_around_box(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> bool:
+        """Bring the hand to where the box is; returns whether a place was found."""
         joints = physics.bind([*self.arm.joints, *self.hand.joints])
         above, prop = np.array(joints.qpos), np.array(physics.bind(self._prop_frame).xpos)
         place_hand = initializers.ToolCenterPointInitializer(
@@ -125,11 +137,16 @@ class BoxTask(JacoTask):
         joints.qpos = above
         return False
 
-    def _close_fingers(self, physics: mjcf.Physics) -> None:
+    def _close_fingers(self, physics: mjcf.Physics, *, box_is_fixed: bool) -> None:
         velocities = np.zeros(physics.model.nu)
         velocities[-len(self.hand.joints) :] = CLOSING_VELOCITY
         physics.set_control(velocities)
-        physics.step(CLOSING_STEPS * self.physics_steps_per_control_step)
+        box = physics.bind(self._prop_frame.freejoint)
+        pose = np.array(box.qpos)
+        for _ in range(CLOSING_STEPS * self.physics_steps_per_control_step):
+            physics.step()
+            if box_is_fixed:  # or it would fall before they hold it
+                box.qpos, box.qvel = pose, 0.0
         physics.set_control(np.zeros(physics.model.nu))
 
     def _hand_touches_box(self, physics: mjcf.Physics) -> bool:

@@ -227,10 +227,10 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins(tmp_path: Path
 
 @pytest.mark.long
 def test_a_soak_for_three_minutes(tmp_path: Path) -> None:
-    """`docs/measure_soak.py` goes on for two hours."""
+    """`benchmarks/measure_soak.py` goes on for two hours."""
     without_end = ["--steps", "100000000", "--updates-per-step", "0.1"]
     flags = [*line(tmp_path)[2:-4], *without_end]  # the script says --run-dir
-    script = Path(__file__).parents[1] / "docs" / "measure_soak.py"
+    script = Path(__file__).parents[1] / "benchmarks" / "measure_soak.py"
     rows = tmp_path / "soak.csv"
     command = [sys.executable, script, "--minutes", "3", "--least", "40", "--most", "60"]
     command += ["--task", "merl.envs.dot:whole", "--output", rows, f"--flags={' '.join(flags)}"]

@@ -1,6 +1,6 @@
 """Small tasks whose answer is known: does an agent learn at all, and what is each sense good for?
 
-Every one is learnt in a minute or a few on one core. `docs/measure_small_tasks.py` runs them over
+Each is learnt in a few minutes on one core. `benchmarks/measure_small_tasks.py` runs them over
 seeds, the tests hold them to their bars.
 """
 

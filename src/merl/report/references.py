@@ -1,7 +1,7 @@
 """What a return is to be compared with: acting at random, not acting, a scripted expert.
 
-The numbers lie in `references.json`, which `docs/measure_references.py` writes; those of others are
-quoted with their source.
+The numbers lie in `references.json`, which `benchmarks/measure_references.py` writes; those of
+others are quoted with their source.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]
 
     Args:
         task: the task's name.
-        env: its form; which are measured, `docs/measure_references.py` says.
+        env: its form; which are measured, `benchmarks/measure_references.py` says.
     """
     return tuple(
         Reference(

@@ -1,6 +1,6 @@
 """Measure what returns are compared with: random actions, no motion, the expert.
 
-python docs/measure_references.py [EPISODES [FORM ...]]
+python benchmarks/measure_references.py [EPISODES [FORM ...]]
 
 Writes src/merl/report/references.json, all of it or the forms that are named ("lift_box occluded").
 No picture is drawn, so the renderer does not matter.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ def measure(task: str, settings: dict[str, Any], episodes: int) -> list[dict[str
     env = make_env(task, renderer="raster", observations=("proprio",), **settings)
     rng = np.random.default_rng(0)
     expert = ExpertPolicy(env)
-    policies = {
+    policies: dict[str, tuple[Callable[..., Any], Callable[[], None]]] = {
         "random actions": (lambda _: rng.uniform(-1, 1, 9).astype(np.float32), lambda: None),
         "no motion": (lambda _: np.zeros(9, np.float32), lambda: None),
         "scripted expert": (expert, expert.reset),

@@ -1,4 +1,4 @@
-"""What each thing that makes an update fast gains: python docs/measure_gains.py.
+"""What each thing that makes an update fast gains: python benchmarks/measure_gains.py.
 
 The update of `merl bench update` (six layers, 84x84, batch 256), as it is and with one thing taken
 back at a time, in turns. One thread and processor time, for what else the machine does is not to

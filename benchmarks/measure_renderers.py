@@ -1,6 +1,6 @@
 """Measure the renderers: images and steps per second, and how near `raster` is to `gl`.
 
-python docs/measure_renderers.py [--states 300] [--rounds 7]
+python benchmarks/measure_renderers.py [--states 300] [--rounds 7]
 
 The speeds take turns within each round; the ratios are taken within a round. `raster` takes one
 thread, `gl` what its OpenGL library takes. Nearness is the mean difference of all pixels (of 255)
@@ -46,18 +46,18 @@ def speeds(rounds: int) -> None:
     base: dict[str, str] = {}
     for size in dict.fromkeys(size for size, _ in SIZES):
         gl = make_renderer("gl", scene.physics, CAMERA.name, size)
-        sides[f"gl {size}"] = (lambda _, gl=gl: gl.render(), 10)
+        sides[f"gl {size}"] = (_drawing(gl), 10)
         base[f"gl {size}"] = f"gl {size}"
     for size, samples in SIZES:
         name = f"raster {size}, {samples}x{samples}"
         raster = make_renderer("raster", scene.physics, CAMERA.name, size, samples)
-        sides[name] = (lambda _, raster=raster: raster.render(), 60)
+        sides[name] = (_drawing(raster), 60)
         base[name] = f"gl {size}"
     for renderer in ("gl", "raster"):
         env = make_env("reach_duplo", renderer=renderer)
         env.reset(seed=0)
         count = 20 if renderer == "gl" else 200
-        sides[f"step with {renderer}"] = (lambda i, env=env: _step(env, actions[i]), count)
+        sides[f"step with {renderer}"] = (_stepping(env, actions), count)
         base[f"step with {renderer}"] = "step with gl"
     rates: dict[str, list[float]] = {name: [] for name in sides}
     for _ in range(rounds):
@@ -71,9 +71,16 @@ def speeds(rounds: int) -> None:
         )
 
 
-def _step(env: Any, action: Any) -> None:
-    if env.step(action)[3]:
-        env.reset()
+def _drawing(renderer: Any) -> Callable[[int], object]:
+    return lambda _: renderer.render()
+
+
+def _stepping(env: Any, actions: Any) -> Callable[[int], object]:
+    def step(i: int) -> None:
+        if env.step(actions[i])[3]:
+            env.reset()
+
+    return step
 
 
 def nearness(states: int) -> None:

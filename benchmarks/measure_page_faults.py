@@ -1,4 +1,4 @@
-"""What keeping freed memory saves: python docs/measure_page_faults.py. One thread, bf16.
+"""What keeping freed memory saves: python benchmarks/measure_page_faults.py. One thread, bf16.
 
 An update with glibc's defaults and one with `keep_freed_memory` take turns; processor time, for
 what else the machine does is not to count.

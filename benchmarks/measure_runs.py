@@ -1,7 +1,9 @@
-"""The runs behind the curves: python docs/measure_runs.py GROUP ... [--seeds 0 1 2] [--jobs 2].
+"""The runs behind the curves.
+
+    python benchmarks/measure_runs.py GROUP ... [--seeds 0 1 2] [--jobs 2]
 
 Runs what is missing of the groups named, `--jobs` at a time, each on one thread at the lowest
-priority, and puts its metrics into docs/data/runs/NAME.csv every few minutes and 50 evaluation
+priority, and puts its metrics into results/runs/NAME.csv every few minutes and 50 evaluation
 episodes of its end into NAME-evaluation.json. What is done is not run again. SIGTERM or Ctrl-C
 saves the runs; the same command continues them. `--list` names them and what has been done. Run it
 in a clone that nothing else changes: an edit would change the runs.
@@ -21,7 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-DATA = ROOT / "docs/data/runs"
+DATA = ROOT / "results/runs"
 RUNS = ROOT / "runs/measured"
 COPY_EVERY = 120.0
 """Seconds."""

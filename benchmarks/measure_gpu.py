@@ -1,4 +1,4 @@
-"""All that is to be measured on a GPU, in one go: python docs/measure_gpu.py --out FOLDER.
+"""All that is to be measured on a GPU, in one go: python benchmarks/measure_gpu.py --out FOLDER.
 
 Six parts, each written as soon as it is done; one that fails is told and does not stop the others:
 
@@ -30,7 +30,7 @@ import torch
 import tyro
 from measure_gains import Change, channels_first
 from rich.console import Console
-from torch.autograd import DeviceType
+from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -93,7 +93,7 @@ def main(
         if name not in parts:
             continue
         try:
-            found = part()
+            found = part()  # type: ignore[no-untyped-call]
         except Exception as error:
             traceback.print_exc()
             console.print(f"{name} failed: {type(error).__name__}: {error}")
@@ -109,11 +109,11 @@ def shown(bench: Any, **asked: Any) -> Any:
 
 
 def loop(repeats: int) -> Any:
-    """The whole loop, with pictures by rays where OpenGL is not to be had."""
+    """The whole loop; with preset laptop where OpenGL is missing."""
     try:
         return shown(train, repeats=repeats)
     except MerlError as error:
-        print(f"{error}: with preset laptop, by rays", file=sys.stderr)
+        print(f"{error}: with preset laptop", file=sys.stderr)
         return shown(train, repeats=repeats, preset="laptop")
 
 
@@ -143,11 +143,11 @@ def agrees(agent: str, batch_size: int) -> dict[str, float]:
     return found
 
 
-class Launches(TorchDispatchMode):
+class Launches(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Counts the operations that compute something."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.count = 0
 
     def __torch_dispatch__(
@@ -213,7 +213,7 @@ def work_of(agent: str, batch_size: int, form: Form) -> tuple[UpdateOnDevice, DD
     replay = OnDevice([update.noise_replay()], device)
     work = UpdateOnDevice(learner, replay, batch_size, seed=0)
     if not form.graph:
-        work._recorded.WARM_UP = sys.maxsize  # type: ignore[misc]
+        work._recorded.WARM_UP = sys.maxsize
     with form.change(learner):
         for _ in range(Recorded.WARM_UP + 2):
             work()

@@ -1,10 +1,10 @@
 """A run that is killed again and again, and whether it loses anything or grows.
 
-    python docs/measure_soak.py                                  # two hours
-    python docs/measure_soak.py --minutes 10 --flags="--num-envs 2"  # other values of `merl train`
+    python benchmarks/measure_soak.py                                  # two hours
+    python benchmarks/measure_soak.py --minutes 10 --flags="--num-envs 2"  # flags of `merl train`
 
 It trains with the environment in a process of its own, is killed (SIGKILL) every one to five
-minutes, and goes on with the same line. A row for each stretch is written to docs/data/soak.csv.
+minutes, and goes on with the same line. A row for each stretch is written to results/soak.csv.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from merl.report.curves import read_metrics
 from merl.training.checkpoint import Checkpoint
 from merl.training.run import Run
 
-OUTPUT = Path(__file__).parent / "data" / "soak.csv"
+OUTPUT = Path(__file__).resolve().parent.parent / "results/soak.csv"
 FLAGS = ("--preset", "laptop", "--no-synchronous", "--threads", "1", "--save-every", "30")
 
 
@@ -134,8 +134,8 @@ def soak(
         step = _saved(run)
         if stretches and step < stretches[-1].step:
             raise SystemExit(f"step {stretches[-1].step} was saved, but now it stands at {step}")
-        rows = read_metrics(run)["step"] if (run / METRICS_FILE).exists() else []
-        reached = int(np.max(rows, initial=step))
+        logged = read_metrics(run)["step"] if (run / METRICS_FILE).exists() else np.array([step])
+        reached = int(np.max(logged, initial=step))
         half = memory[len(memory) // 2 :]  # after the start, with its measurements
         first, last = half[: len(half) // 4 + 1], half[-(len(half) // 4 + 1) :]
         stretches.append(

@@ -1,7 +1,7 @@
 """Our update of DrQ-v2 beside its authors', of which PATH is a clone (facebookresearch/drqv2).
 
-    python docs/compare_with_drqv2.py PATH              # what is computed
-    python docs/compare_with_drqv2.py PATH --repeats 9  # how long it takes
+    python benchmarks/compare_with_drqv2.py PATH              # what is computed
+    python benchmarks/compare_with_drqv2.py PATH --repeats 9  # how long it takes
 
 Both begin with the same weights and are given the same batches, crops and noise, in float64; then
 losses and weights are compared. Timed is the full size in single precision, in turns with what
@@ -21,7 +21,7 @@ from unittest import mock
 
 import torch
 import tyro
-from torch import Tensor, nn
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "agents"))
 from bridge import Case, double, draws_of, error, weather
@@ -100,7 +100,8 @@ def updated(theirs: Any, utils: Any, batch: Batch, chance: Chance) -> dict[str, 
     )
 
     def normal(*_: Any, **__: Any) -> Tensor:
-        return next(noises).clone()
+        noise: Tensor = next(noises)
+        return noise.clone()
 
     with (
         mock.patch.object(torch, "randint", side_effect=crops),
@@ -140,7 +141,7 @@ def made_by_its_authors(
 def weights(ours: DDPG, theirs: Any) -> Iterator[tuple[str, Tensor, Tensor]]:
     """Every weight of either side, and what it belongs to."""
     networks, average = ours.networks, ours.critic_target
-    pairs: dict[str, tuple[nn.Module, nn.Module]] = {
+    pairs: dict[str, tuple[Any, Any]] = {
         "the encoder": (networks.encoders, theirs.encoder),
         "the critic's trunk": (networks.critic_fusion, theirs.critic.trunk),
         "the actor's trunk": (networks.actor_fusion, theirs.actor.trunk),
@@ -160,7 +161,7 @@ def theirs_from(weight: Tensor) -> Tensor:
     """In their order: a trunk reads channels, rows, columns; ours rows, columns, channels."""
     if weight.shape[-1] != SIDE * SIDE * CHANNELS:
         return weight
-    return weight.unflatten(1, (SIDE, SIDE, CHANNELS)).permute(0, 3, 1, 2).flatten(1)
+    return weight.reshape(-1, SIDE, SIDE, CHANNELS).permute(0, 3, 1, 2).flatten(1)
 
 
 def frames(stack: Tensor) -> Tensor:

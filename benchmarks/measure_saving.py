@@ -1,4 +1,4 @@
-"""What saving costs: python docs/measure_saving.py [--preset paper --task move_box].
+"""What saving costs: python benchmarks/measure_saving.py [--preset paper --task move_box].
 
 A run that saves at every episode's end, with the networks and the pictures of its preset, and how
 long a save takes; at the default `--save-every` of 300 seconds, what share of the time that is.

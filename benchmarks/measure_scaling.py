@@ -1,6 +1,6 @@
-"""How cost grows with batch, picture, environments and replay: python docs/measure_scaling.py.
+"""How cost grows with batch, image, environments and replay.
 
-Numbers go to docs/data/scaling.csv, the picture to docs/images/scaling.png; `--questions` with
+Numbers go to results/scaling.csv, the picture to docs/images/scaling.png; `--questions` with
 nothing behind it draws what is there. All sizes of one question take turns, in rounds, but for
 replays; wall-clock time, so leave the machine alone. The updates are the paper's (six layers) in
 bf16, on all cores.
@@ -42,8 +42,8 @@ from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, 
 from merl.resources import free_disk
 from merl.training.timing import use_threads
 
-HERE = Path(__file__).parent
-CSV, PICTURE = HERE / "data" / "scaling.csv", HERE / "images" / "scaling.png"
+ROOT = Path(__file__).resolve().parent.parent
+CSV, PICTURE = ROOT / "results/scaling.csv", ROOT / "docs/images/scaling.png"
 FIELDS = ("question", "side", "x", "median", "low", "high")
 BATCHES = (16, 32, 64, 128, 256, 512)
 SIDES = (32, 48, 64, 84, 100, 128)

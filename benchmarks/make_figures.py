@@ -1,4 +1,4 @@
-"""Draw the pictures of README and docs from the committed numbers: python docs/make_figures.py."""
+"""Draw the figures of README and docs from results/: python benchmarks/make_figures.py."""
 
 import csv
 import json
@@ -12,8 +12,8 @@ from merl.report.figures import learning_curves
 from merl.report.references import references
 from merl.statistics import bootstrap_interval, wilson_interval
 
-DOCS = Path(__file__).parent
-DATA, IMAGES = DOCS / "data", DOCS / "images"
+ROOT = Path(__file__).resolve().parent.parent
+DATA, IMAGES = ROOT / "results", ROOT / "docs/images"
 AGENTS = DATA / "agents"
 MOST = {"state": 100_000, "laptop": 100_000}
 """Steps that the agents are compared over."""
@@ -48,7 +48,7 @@ def laptop() -> None:
     lines = {row.name: row.returns.mean for row in references("reach_duplo")}
     lines.pop("no motion")
     learning_curves(
-        {"MERL, preset laptop": sorted((DOCS / "speedrun/data").glob("laptop-10-s?.csv"))},
+        {"MERL, preset laptop": sorted((ROOT / "docs/speedrun/data").glob("laptop-10-s?.csv"))},
         IMAGES / "laptop.png",
         x="minutes",
         references=lines,

@@ -1,4 +1,4 @@
-"""Draw the tasks as both renderers see them: python docs/make_task_pictures.py (needs OpenGL).
+"""Draw the tasks as both renderers see them (needs OpenGL).
 
 Writes docs/images/tasks.png: the same state by `gl` and `raster`, and how much they differ.
 """
@@ -15,7 +15,7 @@ from merl.envs import make_env
 from merl.envs.config import RendererName
 from merl.tasks import BOX_TASKS, TASKS
 
-OUTPUT = Path(__file__).parent / "images" / "tasks.png"
+OUTPUT = Path(__file__).resolve().parent.parent / "docs/images/tasks.png"
 SEED, SIZE = 3, 240
 RENDERERS: tuple[RendererName, ...] = ("gl", "raster")
 

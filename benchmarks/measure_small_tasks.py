@@ -1,6 +1,6 @@
-"""The small tasks over seeds: python docs/measure_small_tasks.py [SEEDS]. A row per evaluation.
+"""The small tasks over seeds, a row per evaluation: benchmarks/measure_small_tasks.py [SEEDS].
 
-A run that `docs/data/small_tasks.csv` has to its end is not measured again.
+A run that `results/small_tasks.csv` has to its end is not measured again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from merl.report.curves import read_metrics
 from merl.statistics import bootstrap_interval
 
 EVALUATIONS = 10  # of a run, the last one at its end
-OUTPUT = Path(__file__).parent / "data" / "small_tasks.csv"
+OUTPUT = Path(__file__).resolve().parent.parent / "results/small_tasks.csv"
 COLUMNS = {"step": "step", "return": "eval/return"} | {
     end: f"eval/return_{end}" for end in ("low", "high")
 }

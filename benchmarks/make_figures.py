@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from merl.core.statistics import bootstrap_interval, wilson_interval
 from merl.experiments.small_tasks import SPLIT, optimum, returns_of
 from merl.report.curves import Curve, curve
 from merl.report.figures import learning_curves
 from merl.report.references import references
-from merl.statistics import bootstrap_interval, wilson_interval
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA, IMAGES = ROOT / "results", ROOT / "docs/images"

@@ -22,8 +22,8 @@ from merl.agents import ddpg
 from merl.agents.ddpg import DDPG
 from merl.bench.measuring import circumstances
 from merl.bench.update import learner_of, noise_batch
+from merl.core.resources import keep_freed_memory
 from merl.networks import augmentation, encoders, representation
-from merl.resources import keep_freed_memory
 
 Change = Callable[[DDPG], AbstractContextManager[Any]]
 

@@ -18,9 +18,9 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.bench.measuring import Work
 from merl.bench.update import as_sample, noise_batch, reference_of
+from merl.core.resources import keep_freed_memory
 from merl.envs import make_env
 from merl.experiments.presets import compose
-from merl.resources import keep_freed_memory
 from merl.training.timing import random_batch
 
 ROUNDS, UPDATES = 6, 3

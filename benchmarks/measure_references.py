@@ -18,9 +18,9 @@ import numpy as np
 
 from merl.envs import EnvConfig, make_env
 from merl.envs.expert import ExpertPolicy
+from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.report.references import form
 from merl.tasks import BOX_TASKS, TASKS
-from merl.training.evaluation import Evaluation, evaluate
 
 OUTPUT = Path(__file__).parent.parent / "src/merl/report/references.json"
 PUBLISHED = {

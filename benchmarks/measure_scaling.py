@@ -35,11 +35,11 @@ from merl.bench.measuring import Work, circumstances, spread, take_turns
 from merl.bench.train import steps_per_second
 from merl.bench.update import ACTIONS, learner_of, noise_batch, space_of
 from merl.core import Transition
+from merl.core.resources import free_disk
 from merl.envs import make_env
 from merl.networks.augmentation import Crop, draw_shifts
 from merl.replay import Replay, ReplayConfig, pictures, replay_bytes, ring
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
-from merl.resources import free_disk
 from merl.training.timing import use_threads
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from merl.core.statistics import bootstrap_interval
 from merl.experiments.small_tasks import CASES, WHOLE, Case, learn, optimum, returns_of
 from merl.report.curves import read_metrics
-from merl.statistics import bootstrap_interval
 
 EVALUATIONS = 10  # of a run, the last one at its end
 OUTPUT = Path(__file__).resolve().parent.parent / "results/small_tasks.csv"

@@ -26,8 +26,8 @@ import tyro
 
 from merl.core import METRICS_FILE, MerlError
 from merl.report.curves import read_metrics
-from merl.training.checkpoint import Checkpoint
-from merl.training.run import Run
+from merl.runs.checkpoint import Checkpoint
+from merl.runs.run import Run
 
 OUTPUT = Path(__file__).resolve().parent.parent / "results/soak.csv"
 FLAGS = ("--preset", "laptop", "--no-synchronous", "--threads", "1", "--save-every", "30")

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from merl.cli import COMMANDS, main
-from merl.training.config import TrainConfig
-from merl.training.run_folder import run_path
+from merl.config import TrainConfig
+from merl.runs.run_folder import run_path
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -31,9 +31,9 @@ _register()
 
 if TYPE_CHECKING:
     from merl.envs import make_env
-    from merl.training.evaluation import load_policy
+    from merl.evaluation.evaluation import load_policy
 
-_PUBLIC = {"make_env": "merl.envs", "load_policy": "merl.training.evaluation"}
+_PUBLIC = {"make_env": "merl.envs", "load_policy": "merl.evaluation.evaluation"}
 
 
 def __getattr__(name: str) -> Any:

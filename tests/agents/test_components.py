@@ -16,7 +16,7 @@ from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SACConfig
-from merl.training.checkpoint import load_agent, load_networks, save
+from merl.runs.checkpoint import load_agent, load_networks, save
 
 SMALL = {"hidden_dim": 16, "precision": "fp32"}
 VECTORS = {"images": {}, "vectors": {"state": 9}}

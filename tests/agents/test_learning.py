@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from merl.core.statistics import bootstrap_interval
 from merl.experiments.small_tasks import (
     CASES,
     PENDULUM,
@@ -21,7 +22,6 @@ from merl.experiments.small_tasks import (
     returns_of,
 )
 from merl.report.curves import read_metrics
-from merl.statistics import bootstrap_interval
 
 STEPS = {(case.task, case.agent): case.steps for case in CASES}
 

@@ -20,7 +20,7 @@ from merl.agents.ddpg import DDPG, Draws
 from merl.bench import update as bench
 from merl.bench.plain import Plain
 from merl.core import Batch, MerlError
-from merl.training.machine import commit
+from merl.runs.provenance import commit
 
 SIDE, PROPRIO, ACTIONS, BATCH, WIDTH = 24, 7, 4, 6, 16
 FEATURES = 32 * 5 * 5

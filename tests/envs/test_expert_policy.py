@@ -7,7 +7,7 @@ import pytest
 from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.expert import ExpertPolicy
-from merl.training.evaluation import evaluate
+from merl.evaluation.evaluation import evaluate
 
 
 class Wrapped(gymnasium.Wrapper):

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 from merl.agents import AGENTS
+from merl.config import EvaluationConfig, TrainConfig
 from merl.core import MerlError
 from merl.experiments.presets import PRESETS, PUBLISHED, compose
-from merl.training.config import EvaluationConfig, TrainConfig
 
 
 def test_preset_paper_is_table_1() -> None:

@@ -17,12 +17,12 @@ from merl.agents import AGENTS, make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.merl import MERLConfig
 from merl.cli import main
+from merl.config import TrainConfig
 from merl.core import MerlError, Transition
+from merl.evaluation.evaluation import Policy
 from merl.networks.settings import torch_settings
 from merl.replay import Lanes, ReplayConfig
-from merl.training import checkpoint
-from merl.training.config import TrainConfig
-from merl.training.evaluation import Policy
+from merl.runs import checkpoint
 from merl.training.loop import Randomness
 from merl.training.updating import make_update
 from toy import DotEnv

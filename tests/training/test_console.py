@@ -10,11 +10,11 @@ import pytest
 from rich.console import Console
 
 from helpers import flat
+from merl.acting.rollout import Episode
+from merl.evaluation.evaluation import Evaluation, summarize
 from merl.training import console as console_module
 from merl.training.console import ConsoleView, describe, sparkline
-from merl.training.evaluation import Evaluation, summarize
 from merl.training.loop import Moment
-from merl.training.rollout import Episode
 
 METRICS = {
     "train/return": 12.34,

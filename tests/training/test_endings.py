@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import unruly_envs
-from unruly_envs import DEFAULT, unruly
 
 import merl
+import unruly_envs
 from merl.cli import main
 from merl.report.curves import read_metrics
 from merl.training.evaluator import ATTEMPTS
 from merl.training.timing import Arithmetic, Timing
+from unruly_envs import DEFAULT, unruly
 
 _FLAGS = {
     "--agent": "ddpg",
@@ -42,7 +42,7 @@ FLAGS = [str(part) for flag in _FLAGS.items() for part in flag]
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """In a folder of its own; nothing is timed or drawn, and no references are measured."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "merl.training.parts.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
@@ -150,7 +150,7 @@ def test_an_exception_of_merls_own_in_an_evaluation_is_one_line(
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("merl.training.evaluation.summarize", full)
+    monkeypatch.setattr("merl.evaluation.evaluation.summarize", full)
     assert train() == 4
     error = capsys.readouterr().err
     assert "the evaluation at step 20 failed: OSError: [Errno 28] No space left" in error

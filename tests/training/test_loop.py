@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from merl.acting.environments import Here
+from merl.acting.rollout import Episode, Fetched, FrameStack, mean_metrics
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
+from merl.config import TrainConfig
 from merl.replay import Lanes, ReplayConfig
 from merl.replay.on_device import OnDevice
 from merl.training import loop
-from merl.training.acting import Here
-from merl.training.config import TrainConfig
 from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train, updates_due
-from merl.training.rollout import Episode, Fetched, FrameStack, mean_metrics
 from merl.training.updating import UpdateFromHost, UpdateOnDevice, update_from_host
 from toy import DotEnv
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from merl.agents.merl import MERLConfig
+from merl.config import EvaluationConfig, TrainConfig
 from merl.core import MerlError
 from merl.replay import ReplayConfig
 from merl.training import timing
-from merl.training.config import EvaluationConfig, TrainConfig
 from merl.training.timing import WORTH_COMPILING, Arithmetic, Timing, measure, worth_compiling
 from toy import DotEnv
 

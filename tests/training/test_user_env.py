@@ -16,20 +16,20 @@ import torch
 from gymnasium import spaces
 
 import merl
+from merl.acting.environments import _Maker
+from merl.acting.run_env import EnvSpaces, key_lines, make_run_env, run_spaces
 from merl.agents import AGENTS
 from merl.cli import main
+from merl.config import TrainConfig
 from merl.core import EnvironmentFailed, MerlError
 from merl.envs.adapted import adapt
 from merl.envs.config import UserEnvConfig
+from merl.evaluation.evaluation import evaluate
 from merl.experiments.presets import compose
 from merl.report.curves import read_metrics
-from merl.training.acting import _Maker
-from merl.training.config import TrainConfig
-from merl.training.environment import EnvSpaces, key_lines, make_run_env, run_spaces
-from merl.training.evaluation import evaluate
+from merl.runs.plain import box, describe, told
+from merl.runs.run import Run
 from merl.training.parts import Parts
-from merl.training.plain import box, describe, told
-from merl.training.run import Run
 
 LENGTH = 5
 SMALL = [

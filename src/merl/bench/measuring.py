@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import torch
 
 import merl
-from merl.resources import keep_freed_memory
-from merl.training.machine import commit, machine, package_versions
+from merl.core.resources import keep_freed_memory
+from merl.runs.provenance import commit, machine, package_versions
 
 Work = Callable[[], object]
 

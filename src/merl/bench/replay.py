@@ -18,10 +18,10 @@ from torch import Tensor
 
 from merl.bench.measuring import Work, circumstances, seconds, shown, spread, take_turns
 from merl.core import Copies, MerlError, Transition
+from merl.core.resources import free_disk
 from merl.envs import make_env
 from merl.networks.augmentation import Crop, draw_shifts, to_input
 from merl.replay import Replay, ReplayConfig, replay_bytes
-from merl.resources import free_disk
 
 EPISODE, PAD, MILLION = 250, 4, 1_000_000
 RAW, COMPRESSED = "raw", "compressed (--replay.compress)"

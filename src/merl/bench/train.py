@@ -16,18 +16,18 @@ from typing import Any
 import torch
 from rich.table import Table
 
+from merl.acting.environments import Environments, Here, Workers
+from merl.acting.rollout import FrameStack
+from merl.acting.run_env import make_run_env, run_spaces
 from merl.agents import make_agent
 from merl.bench.measuring import Side, circumstances, shown, spread
+from merl.config import TrainConfig
 from merl.core import counted, is_image
+from merl.core.resources import keep_freed_memory
 from merl.experiments.presets import compose
 from merl.replay import Lanes
-from merl.resources import keep_freed_memory
-from merl.training.acting import Environments, Here, Workers
-from merl.training.config import TrainConfig
-from merl.training.environment import make_run_env, run_spaces
 from merl.training.loop import Progress, Randomness, Stage, train
 from merl.training.parts import choose_device
-from merl.training.rollout import FrameStack
 from merl.training.timing import measure, use_threads
 from merl.training.updating import make_update
 

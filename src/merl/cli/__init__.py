@@ -22,8 +22,8 @@ from typing import Any
 
 import merl
 from merl.core import MerlError, meant
-from merl.python_path import working_folder_hidden
-from merl.training.output import tolerant_output
+from merl.core.output import tolerant_output
+from merl.core.python_path import working_folder_hidden
 
 # The modules are imported when called: a misspelt command should not wait for torch.
 COMMANDS = {

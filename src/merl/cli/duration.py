@@ -9,10 +9,10 @@ from datetime import timedelta
 
 from rich.console import Console
 
+from merl.config import TrainConfig
 from merl.core import counted
-from merl.training.config import TrainConfig
+from merl.evaluation.evaluation import Evaluation
 from merl.training.console import ConsoleView
-from merl.training.evaluation import Evaluation
 from merl.training.loop import Moment
 from merl.training.parts import Parts
 from merl.training.timing import Timing

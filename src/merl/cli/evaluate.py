@@ -15,12 +15,12 @@ from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
+from merl.evaluation.evaluation import EVALUATION_SEED, load_policy
+from merl.evaluation.evaluation import evaluate as evaluate_policy
+from merl.evaluation.video import MIN_SIDE
 from merl.report.references import references
+from merl.runs.run import Run
 from merl.training.console import describe
-from merl.training.evaluation import EVALUATION_SEED, load_policy
-from merl.training.evaluation import evaluate as evaluate_policy
-from merl.training.run import Run
-from merl.training.video import MIN_SIDE
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from merl.bench.renderers import renderer_speeds
 from merl.cli.output import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError, counted
+from merl.core.resources import available_memory, free_disk
 from merl.experiments.presets import compose
-from merl.resources import available_memory, free_disk
-from merl.training.machine import machine, package_versions
+from merl.runs.provenance import machine, package_versions
 from merl.training.parts import Parts
 
 TASK = "reach_duplo"

@@ -12,8 +12,8 @@ import tyro
 from merl.cli.parsing import parse
 from merl.cli.running import go_on, tell_trusted
 from merl.core import MerlError
-from merl.training.resuming import reopened
-from merl.training.run import Run
+from merl.runs.resume import reopened
+from merl.runs.run import Run
 
 
 @dataclass(frozen=True)

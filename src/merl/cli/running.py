@@ -10,21 +10,21 @@ from pathlib import Path
 
 from rich.filesize import decimal
 
+from merl.acting.run_env import key_lines, own_bounds
 from merl.cli.duration import DurationView, duration
 from merl.cli.output import make_console
 from merl.cli.summary import summarize
+from merl.config import TrainConfig
 from merl.core import MerlError, NotSaved, counted, is_image
 from merl.replay import replay_bytes
 from merl.report.references import EXPERT, RANDOM, references
+from merl.runs.checkpoint import Checkpoint, readable
+from merl.runs.resume import REOPENED, left_open, reopened, taken_up
+from merl.runs.run import Run
+from merl.runs.run_folder import check_links, resume_line
 from merl.training import trainer
-from merl.training.checkpoint import Checkpoint, readable
-from merl.training.config import TrainConfig
 from merl.training.console import ConsoleView
-from merl.training.environment import key_lines, own_bounds
 from merl.training.parts import Parts, device_name
-from merl.training.resuming import REOPENED, left_open, reopened, taken_up
-from merl.training.run import Run
-from merl.training.run_folder import check_links, resume_line
 from merl.training.stretch import Outcome
 
 DAY = 86_400.0  # seconds

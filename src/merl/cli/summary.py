@@ -8,13 +8,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from merl.acting.run_env import make_run_env
+from merl.config import TrainConfig
 from merl.core import MerlError, counted
 from merl.envs.adapted import in_one_line
+from merl.evaluation.evaluation import Act, Evaluation, evaluate
 from merl.report.references import RANDOM, Reference, references
-from merl.training.config import TrainConfig
-from merl.training.environment import make_run_env
-from merl.training.evaluation import Act, Evaluation, evaluate
-from merl.training.run_folder import resume_line
+from merl.runs.run_folder import resume_line
 from merl.training.stretch import Outcome
 
 FLOORS = (RANDOM, "no motion")

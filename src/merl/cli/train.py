@@ -12,11 +12,11 @@ import tyro
 
 from merl.cli.parsing import parse
 from merl.cli.running import begin, go_on
+from merl.config import Setting, TrainConfig
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import PRESETS, compose
-from merl.training.config import Setting, TrainConfig
-from merl.training.resuming import decided, left_open
-from merl.training.run import Run
+from merl.runs.resume import decided, left_open
+from merl.runs.run import Run
 
 
 @dataclass(frozen=True)

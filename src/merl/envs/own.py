@@ -17,11 +17,11 @@ import numpy as np
 from gymnasium.envs.registration import registry
 
 from merl.core import MerlError, meant
+from merl.core.python_path import set_value, users_value
 from merl.envs.adapted import adapt, failing, in_one_line
 from merl.envs.config import UserEnvConfig
 from merl.envs.packages import installing
 from merl.envs.registration import ENV_IDS
-from merl.python_path import set_value, users_value
 
 BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that come with merl."""

@@ -10,11 +10,11 @@ from typing import Any, get_args
 import tyro
 
 from merl.agents import AGENTS
+from merl.config import EvaluationConfig, Setting, TrainConfig
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
-from merl.training.config import EvaluationConfig, Setting, TrainConfig
 
 _TASK: str = tyro.MISSING  # the command line asks for it
 

@@ -14,15 +14,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from merl.agents import AGENTS
+from merl.config import EvaluationConfig, TrainConfig
 from merl.envs.config import EnvConfig
 from merl.envs.own import make_own
+from merl.evaluation.evaluation import EVALUATION_SEED, Evaluation
 from merl.replay import ReplayConfig
+from merl.runs.run import Run
 from merl.training import trainer
-from merl.training.config import EvaluationConfig, TrainConfig
-from merl.training.evaluation import EVALUATION_SEED, Evaluation
 from merl.training.loop import Moment
 from merl.training.parts import Parts
-from merl.training.run import Run
 
 WHOLE, SPLIT, PENDULUM = "merl.envs.dot:whole", "merl.envs.dot:split", "Pendulum-v1"
 Precision = Literal["fp32", "bf16"]

@@ -10,9 +10,9 @@ from pathlib import Path
 import gymnasium
 
 from merl.core import MerlError, counted
+from merl.core.resources import available_memory, existing_parent, free_disk
 from merl.replay.compression import SLOTS_OF_ANY_PICTURE
 from merl.replay.storage import fields_of
-from merl.resources import available_memory, existing_parent, free_disk
 
 MOST_N_STEP, MOST_FRAME_STACK = 1000, 100
 """What is still sampled in reasonable time and memory."""

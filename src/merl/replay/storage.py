@@ -24,9 +24,9 @@ import gymnasium
 import numpy as np
 
 from merl.core import MerlError, is_image, is_vector
+from merl.core.resources import reserve_file
 from merl.replay.compression import reserved_bytes
 from merl.replay.places import Move, Places
-from merl.resources import reserve_file
 
 _FORMAT = 1
 _HEADER = "replay.json"

@@ -3,6 +3,6 @@
 Everything here works from a run's folder alone and needs neither torch nor MuJoCo.
 """
 
-from merl.resources import load_matplotlib
+from merl.core.resources import load_matplotlib
 
 load_matplotlib()

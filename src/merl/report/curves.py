@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import METRICS_FILE, MerlError
-from merl.statistics import bootstrap_interval
+from merl.core.statistics import bootstrap_interval
 
 Array = NDArray[np.float64]
 Band = Literal["range", "bootstrap"]

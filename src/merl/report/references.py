@@ -12,8 +12,8 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
+from merl.core.statistics import Interval
 from merl.envs.config import EnvConfig
-from merl.statistics import Interval
 
 RANDOM = "random actions"
 """The reference that acts at random."""

@@ -17,9 +17,9 @@ from rich.table import Table
 from rich.text import Text
 
 from merl.core import METRICS_FILE, counted
-from merl.training.evaluation import Evaluation
+from merl.evaluation.evaluation import Evaluation
+from merl.runs.run import Run
 from merl.training.loop import Moment
-from merl.training.run import Run
 
 RECENT = 10
 """Training episodes over which the shown means are taken."""

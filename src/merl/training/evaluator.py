@@ -6,14 +6,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from merl.core import EvaluationFailed, MerlError
+from merl.core.signals import Interrupt
 from merl.envs.adapted import in_one_line
-from merl.training.evaluation import Evaluation, Policy, evaluate
+from merl.evaluation.evaluation import Evaluation, Policy, evaluate
+from merl.runs.metrics import MetricsWriter
+from merl.runs.run import Run
+from merl.runs.run_folder import resume_line
 from merl.training.meters import Clock
-from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
-from merl.training.run import Run
-from merl.training.run_folder import resume_line
-from merl.training.signals import Interrupt
 
 if TYPE_CHECKING:
     from merl.training.stretch import View

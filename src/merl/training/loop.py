@@ -17,12 +17,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from merl.acting.environments import Environments, Lost
+from merl.acting.rollout import Episode, Fetched, FrameStack, side_by_side
+from merl.config import TrainConfig
 from merl.core import Agent, Transition
+from merl.core.guards import check_moment
 from merl.replay import Lanes
-from merl.training.acting import Environments, Lost
-from merl.training.config import TrainConfig
-from merl.training.guards import check_moment
-from merl.training.rollout import Episode, Fetched, FrameStack, side_by_side
 
 
 @dataclass

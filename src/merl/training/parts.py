@@ -14,22 +14,22 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
+from merl.acting.env_checks import check_instances
+from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
+from merl.config import TrainConfig
 from merl.core import MerlError, counted
+from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.own import load_module
+from merl.evaluation.video import MIN_SIDE
 from merl.replay import check_fits
-from merl.resources import available_memory, keep_freed_memory
-from merl.training.config import TrainConfig
-from merl.training.env_checks import check_instances
-from merl.training.environment import EnvSpaces, make_run_env, run_spaces
+from merl.runs.resume import left_open
+from merl.runs.run_folder import refuse_existing, run_path
 from merl.training.loop import Progress, Randomness
-from merl.training.resuming import left_open
-from merl.training.run_folder import refuse_existing, run_path
 from merl.training.timing import measure, use_threads
-from merl.training.video import MIN_SIDE
 
 
 class Parts:

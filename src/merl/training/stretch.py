@@ -9,6 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from merl.acting.environments import Environments, Lost
+from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.core import (
     EnvironmentFailed,
     EnvironmentsLost,
@@ -18,22 +20,20 @@ from merl.core import (
     counted,
     is_image,
 )
+from merl.core.guards import LossGuard
+from merl.core.signals import Interrupt
+from merl.evaluation.evaluation import Evaluation
 from merl.replay import Lanes
-from merl.training import checkpoint
-from merl.training.acting import Environments, Lost
-from merl.training.checkpoint import Checkpoint
-from merl.training.evaluation import Evaluation
+from merl.runs import checkpoint
+from merl.runs.checkpoint import Checkpoint
+from merl.runs.metrics import MetricsWriter
+from merl.runs.plain import to_plain
+from merl.runs.run import Run
+from merl.runs.run_folder import resume_line
 from merl.training.evaluator import Evaluations
-from merl.training.guards import LossGuard
 from merl.training.loop import Moment, Progress, Stage, train
 from merl.training.meters import Averages, Clock, Interval
-from merl.training.metrics import MetricsWriter
 from merl.training.parts import Parts
-from merl.training.plain import to_plain
-from merl.training.rollout import FrameStack, mean_metrics, report_success
-from merl.training.run import Run
-from merl.training.run_folder import resume_line
-from merl.training.signals import Interrupt
 from merl.training.updating import make_update
 
 LONG = 2000

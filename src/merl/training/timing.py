@@ -23,9 +23,9 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
+from merl.config import TrainConfig
 from merl.core import Batch, MerlError, counted, is_image
 from merl.networks.settings import torch_settings
-from merl.training.config import TrainConfig
 from merl.training.loop import Update
 from merl.training.updating import Recorded
 

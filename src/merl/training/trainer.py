@@ -5,15 +5,15 @@ from __future__ import annotations
 import dataclasses
 from contextlib import ExitStack
 
+from merl.acting.environments import Here, Workers
+from merl.acting.run_env import own_bounds
+from merl.core.signals import Interrupt
 from merl.networks.settings import torch_settings
 from merl.replay import Lanes
-from merl.training.acting import Here, Workers
-from merl.training.checkpoint import Checkpoint
-from merl.training.environment import own_bounds
-from merl.training.metrics import MetricsWriter
+from merl.runs.checkpoint import Checkpoint
+from merl.runs.metrics import MetricsWriter
+from merl.runs.run import Run
 from merl.training.parts import Parts
-from merl.training.run import Run
-from merl.training.signals import Interrupt
 from merl.training.stretch import Outcome, Stretch, View
 
 

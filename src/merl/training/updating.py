@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from merl.agents.ddpg import DDPG
+from merl.config import TrainConfig
 from merl.core import Batch
 from merl.networks.settings import torch_settings
 from merl.replay import Lanes
 from merl.replay.on_device import OnDevice, bytes_on_device
-from merl.training.config import TrainConfig
 from merl.training.loop import Randomness, Update
 
 ROOM = 0.8

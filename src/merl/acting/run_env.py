@@ -1,0 +1,272 @@
+"""The environment of a run: made from its config, and narrowed to what its agent consumes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import FilterObservation
+
+from merl.acting.env_checks import refuse_running_statistics
+from merl.acting.generators import global_state, set_global_state
+from merl.agents.config import AgentConfig
+from merl.agents.networks import modalities, told_to_critic
+from merl.config import TrainConfig
+from merl.core import MerlError, is_image
+from merl.core.signals import handlers_kept
+from merl.envs import make_env
+from merl.envs.action_repeat import ActionRepeat
+from merl.envs.config import OBSERVATIONS, EnvConfig
+from merl.envs.own import make_own
+from merl.envs.user_spaces import brief
+
+
+def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
+    """The environment of a run, with fields of its `EnvConfig` (or `render_mode`) changed.
+
+    It gives what the agent consumes and nothing else: what nobody consumes is never rendered.
+
+    Raises:
+        MerlError: there is no such environment, or it lacks what the agent consumes.
+    """
+    render_mode = changes.pop("render_mode", None)
+    env: gymnasium.Env[Any, Any]
+    if config.own_env:
+        changes.pop("render_size", None)
+        if changes:
+            raise MerlError(
+                f"{', '.join(changes)} is for merl's own tasks: {config.task} decides for itself "
+                "how it is seen"
+            )
+        with handlers_kept():
+            env = Supervised(make_own(config.task, render_mode, config.user_env))
+        refuse_running_statistics(env)
+    else:
+        seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))
+        settings = {name: getattr(seen, name) for name in type(seen).__dataclass_fields__}
+        env = make_env(config.task, render_mode=render_mode, **settings | changes)
+    if config.action_repeat > 1:
+        env = ActionRepeat(env, config.action_repeat)
+    try:
+        consumed, _ = run_spaces(config, env)
+    except BaseException:
+        env.close()
+        raise
+    return env if consumed == env.observation_space else FilterObservation(env, tuple(consumed))
+
+
+class Supervised(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A user's environment, after each of whose calls the signal handlers are put back.
+
+    Simulators and drivers install handlers of their own, which would swallow Ctrl-C.
+    """
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; see `gymnasium.Env.reset`."""
+        with handlers_kept():
+            return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Take an action; see `gymnasium.Env.step`."""
+        with handlers_kept():
+            return self.env.step(action)
+
+    def render(self) -> Any:
+        """See `gymnasium.Env.render`."""
+        with handlers_kept():
+            return self.env.render()
+
+    def close(self) -> None:
+        """Close it; Ctrl-C gives up waiting for that, and what follows goes on."""
+        try:
+            with handlers_kept():
+                self.env.close()
+        except KeyboardInterrupt:
+            warnings.warn("closing the environment was interrupted", stacklevel=1)
+
+
+def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Box]:
+    """What the agent consumes of the observation, and the actions."""
+    space = env.observation_space
+    assert isinstance(space, spaces.Dict)
+    assert isinstance(env.action_space, spaces.Box)
+    images, vectors = modalities(config.agent, space)
+    keys = (*images, *vectors, *told_to_critic(config.agent, space))
+    return spaces.Dict({key: space[key] for key in keys}), env.action_space
+
+
+def own_bounds(env: gymnasium.Env[Any, Any]) -> tuple[list[float], list[float]] | None:
+    """The bounds of the environment's own actions, lower and upper, where they were rescaled."""
+    bounds: tuple[list[float], list[float]] | None = None
+    if env.has_wrapper_attr("own_bounds"):
+        bounds = env.get_wrapper_attr("own_bounds")
+    return bounds
+
+
+@dataclass(frozen=True)
+class EnvSpaces:
+    """The spaces by which two instances of an environment are recognised as the same.
+
+    Attributes:
+        observation: what the agent consumes.
+        action: what it does, in [-1, 1].
+        bounds: of the environment's own actions, where they were rescaled.
+    """
+
+    observation: spaces.Dict
+    action: spaces.Box
+    bounds: tuple[list[float], list[float]] | None
+
+    @classmethod
+    def of(cls, config: TrainConfig, env: gymnasium.Env[Any, Any]) -> EnvSpaces:
+        """The spaces of a run's environment."""
+        return cls(*run_spaces(config, env), own_bounds(env))
+
+    def check(self, other: EnvSpaces, what: str) -> None:
+        """Check that another instance has the same spaces.
+
+        Args:
+            other: its spaces.
+            what: the other instance, for the message.
+
+        Raises:
+            MerlError: naming what differs.
+        """
+        mine, theirs = self._parts(), other._parts()
+        differs = []
+        for name in mine | theirs:
+            one, two = mine.get(name), theirs.get(name)
+            if one != two:
+                differs.append(f"{name} is {_in_words(one)} and {_in_words(two)}")
+        if differs:
+            raise MerlError(
+                f"two instances of the environment differ, the first one and {what}: "
+                f"{'; '.join(differs)}: make all instances alike"
+            )
+
+    def _parts(self) -> dict[str, Any]:
+        parts: dict[str, Any] = {
+            f"observation {key!r}": space for key, space in self.observation.items()
+        }
+        return parts | {"action": self.action, "the actions' bounds": self.bounds}
+
+
+def _in_words(part: Any) -> str:
+    if part is None:
+        return "not there"
+    if isinstance(part, spaces.Space):
+        return brief(part)
+    low, high = part
+    return f"low {low}, high {high}"
+
+
+def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
+    """Say which observation keys the agent uses, as what, and which it leaves out and why.
+
+    Args:
+        config: of the run.
+        env: made by `make_run_env`.
+
+    Returns:
+        A line each for images, vectors, those for the critic alone, and those left out.
+    """
+    space, _ = run_spaces(config, env)
+    images, vectors = modalities(config.agent, space)
+    groups = {
+        "images used": images,
+        "vectors used": vectors,
+        "vectors used by the critic alone": told_to_critic(config.agent, space),
+    }
+    lines = [
+        f"{group}: {', '.join(f'{key} ({_size(space[key])})' for key in keys)}"
+        for group, keys in groups.items()
+        if keys
+    ]
+    left_out = {}
+    if env.has_wrapper_attr("left_out"):
+        for key, given in env.get_wrapper_attr("modalities").items():
+            if key in space.spaces:  # `key in space` would ask whether it is an observation
+                continue
+            kind = "images" if is_image(given.space) else "vectors"
+            left_out[key] = f"--agent.{kind} names others"
+            if not getattr(config.agent, kind):
+                left_out[key] = (
+                    f"agent {config.agent_name} uses no {kind}, --agent.{kind} adds them"
+                )
+        left_out |= env.get_wrapper_attr("left_out")
+    if left_out:
+        lines.append("; ".join(f"{key!r} is not used: {why}" for key, why in left_out.items()))
+    return lines
+
+
+def _size(space: spaces.Space[Any]) -> str:
+    assert isinstance(space, spaces.Box)
+    if is_image(space):
+        height, width, channels = space.shape
+        return f"{height} x {width} x {channels}, from {space.low.min()} to {space.high.max()}"
+    return "1 number" if space.shape == (1,) else f"{space.shape[0]} numbers"
+
+
+def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return the state of the generators that an environment draws from, as plain types.
+
+    Returns:
+        The state of the environment's `np_random` (`bit_generator` is one of its keys), empty if
+        the environment does not use it, and under `globals` that of the process's global
+        generators. An environment with other generators meets other episodes after a resume.
+    """
+    state: dict[str, Any] = {}
+    # Gymnasium's `np_random` makes a generator on access; this attribute is one that is in use.
+    generator = getattr(env.unwrapped, "_np_random", None)
+    if isinstance(generator, np.random.Generator):
+        state = dict(generator.bit_generator.state)
+        try:
+            json.dumps(state)
+        except TypeError:
+            state = {}
+    return state | {"globals": global_state()}
+
+
+def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any] | None) -> None:
+    """Restore from `environment_state()`."""
+    own = dict(state or {})
+    shared = own.pop("globals", None)
+    if shared is not None:
+        set_global_state(shared)
+    if own:
+        env.unwrapped.np_random.bit_generator.state = own
+
+
+def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
+    """Of what the Jaco environments can give: what the agent names, else what the config has.
+
+    `state`, which no robot could measure, has to be named.
+
+    Raises:
+        MerlError: nothing but `state` is left, and it is not named.
+    """
+    images, vectors = agent.images, agent.vectors
+    default = [
+        name
+        for name in env.observations
+        if (images is None if name == "image" else vectors is None and name != "state")
+    ]
+    named = {*(images or ()), *(vectors or ()), *agent.critic_vectors}
+    if not named <= set(OBSERVATIONS):  # the agent's check says which there are
+        return OBSERVATIONS
+    asked = [name for name in OBSERVATIONS if name in named or name in default]
+    if not asked and vectors is None and "state" in env.observations:
+        raise MerlError(
+            f"the agent finds nothing to sense among {sorted(env.observations)}: name it with "
+            "--agent.vectors state, or take --agent merl_state, ddpg or sac"
+        )
+    return tuple(asked) or env.observations

@@ -1,0 +1,47 @@
+"""Types, errors and small helpers that every room may use."""
+
+from merl.core.errors import (
+    EnvironmentFailed,
+    EnvironmentsLost,
+    EvaluationFailed,
+    MerlError,
+    NotFinite,
+    NotSaved,
+    check_choice,
+    counted,
+    meant,
+)
+from merl.core.types import (
+    CONFIG_FILE,
+    METRICS_FILE,
+    Agent,
+    Batch,
+    Copies,
+    Copy,
+    Observation,
+    Transition,
+    is_image,
+    is_vector,
+)
+
+__all__ = [
+    "CONFIG_FILE",
+    "METRICS_FILE",
+    "Agent",
+    "Batch",
+    "Copies",
+    "Copy",
+    "EnvironmentFailed",
+    "EnvironmentsLost",
+    "EvaluationFailed",
+    "MerlError",
+    "NotFinite",
+    "NotSaved",
+    "Observation",
+    "Transition",
+    "check_choice",
+    "counted",
+    "is_image",
+    "is_vector",
+    "meant",
+]

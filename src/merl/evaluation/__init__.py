@@ -1,0 +1,1 @@
+"""Evaluation of a policy, its videos, and policies of saved runs."""

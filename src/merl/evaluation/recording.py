@@ -1,0 +1,94 @@
+"""The video of an episode, as the environment renders it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from merl.acting.rollout import Episode
+from merl.core import MerlError
+from merl.envs.adapted import in_one_line
+from merl.envs.frame_rate import frame_rate
+from merl.evaluation.video import FPS, Value, VideoWriter
+
+
+def warn_user(message: str) -> None:
+    """Warn by Python's means, at the caller of the caller."""
+    warnings.warn(message, stacklevel=3)
+
+
+class EpisodeVideo:
+    """The video of an episode: a failure ends the video, and never the episode.
+
+    Args:
+        path: where to write it.
+        env: is rendered for each frame.
+        warn: receives the reason of a failure; without it, a failure is an error.
+    """
+
+    def __init__(
+        self, path: Path, env: gymnasium.Env[Any, Any], warn: Callable[[str], None] | None
+    ) -> None:
+        self._path, self._env, self._warn = path, env, warn
+        rate = frame_rate(env.metadata)
+        if rate is None:
+            (warn or warn_user)(
+                f"the environment's metadata has no usable render_fps: its videos have {FPS:g} "
+                "frames a second"
+            )
+        self._writer: VideoWriter | None = None
+        with self._failing():
+            self._writer = VideoWriter(path, fps=FPS if rate is None else rate)
+
+    def add(self, episode: Episode) -> None:
+        """Append what the environment renders now, with the episode's numbers so far.
+
+        Raises:
+            MerlError: the video cannot be made, and there is no `warn`.
+        """
+        if self._writer is not None:
+            with self._failing():
+                self._writer.add(np.asarray(self._env.render()), _caption(episode))
+
+    def close(self) -> None:
+        """Complete the video.
+
+        Raises:
+            MerlError: the video cannot be made, and there is no `warn`.
+        """
+        if self._writer is not None:
+            with self._failing():
+                self._writer.close()
+
+    def abort(self) -> None:
+        """Remove a video that is not complete."""
+        if self._writer is not None:
+            self._writer.abort()
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # of the user's `render`, of the encoder, of the disk
+            self.abort()
+            self._writer = None
+            why = str(error) if isinstance(error, MerlError) else in_one_line(error)
+            if self._warn is None:
+                raise MerlError(f"the video {self._path} cannot be made: {why}") from error
+            self._warn(f"there is no video of this evaluation: {why}")
+
+
+def _caption(episode: Episode) -> dict[str, Value]:
+    caption: dict[str, Value] = {
+        "step": episode.length,
+        "return": episode.total_reward,
+    }
+    if episode.success is not None:
+        caption["success"] = episode.success
+    return caption

@@ -1,0 +1,1 @@
+"""A run's folder: config, checkpoints, metrics, and where it came from."""

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import warnings
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces, wrappers
+from gymnasium.vector import SyncVectorEnv
+
+from merl.acting.env_checks import check_instances, refuse_running_statistics
+from merl.core import MerlError
+from merl.envs.adapted import adapt
+
+
+class Plain(gymnasium.Env[Any, Any]):
+    """Three numbers from the seed."""
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-9.0, 9.0, (3,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self.np_random.normal(size=3).astype(np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        return self.np_random.normal(size=3).astype(np.float32), 0.0, False, False, {}
+
+
+class MyNormalizer(wrappers.NormalizeObservation):  # type: ignore[misc]
+    pass
+
+
+class RunningMeanStd:
+    """As other libraries call it."""
+
+
+class TheirNormalizer(gymnasium.Wrapper[Any, Any, Any, Any]):
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.statistics = RunningMeanStd()
+
+
+class Holding(Plain):
+    """An environment around another one, which is no wrapper of Gymnasium's."""
+
+    def __init__(self, inner: Any) -> None:
+        super().__init__()
+        self._robots = [inner]
+
+
+def frozen(env: Any) -> Any:
+    normalized = wrappers.NormalizeObservation(env)
+    normalized.update_running_mean = False
+    return normalized
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: wrappers.NormalizeObservation(Plain()),
+        lambda: wrappers.NormalizeReward(Plain()),
+        lambda: MyNormalizer(Plain()),
+        lambda: TheirNormalizer(Plain()),
+        lambda: wrappers.TimeLimit(wrappers.ClipReward(wrappers.NormalizeReward(Plain()), -1), 9),
+        lambda: Holding(wrappers.NormalizeObservation(Plain())),
+        lambda: Holding(wrappers.vector.NormalizeObservation(SyncVectorEnv([Plain]))),
+        lambda: Holding(wrappers.vector.NormalizeReward(SyncVectorEnv([Plain]))),
+        lambda: Holding(SyncVectorEnv([lambda: wrappers.NormalizeReward(Plain())])),
+    ],
+)
+def test_running_statistics_are_refused_anywhere(make: Any) -> None:
+    with pytest.raises(MerlError, match=r"--agent\.standardize") as refused:
+        refuse_running_statistics(adapt(make()))
+    assert "Normalize" in str(refused.value) or "MyNormalizer" in str(refused.value)
+
+
+class Keeping(Plain):
+    """Statistics that are no attribute, but lie in a dict, or in an object that is one."""
+
+    def __init__(self, statistics: Any) -> None:
+        super().__init__()
+        self.kept = statistics
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        {"obs": RunningMeanStd()},
+        [RunningMeanStd()],
+        SimpleNamespace(obs=RunningMeanStd()),
+        SimpleNamespace(parts=[RunningMeanStd()]),
+    ],
+    ids=["dict", "list", "object", "object with a list"],
+)
+def test_running_statistics_in_containers_are_refused(kept: Any) -> None:
+    with pytest.raises(MerlError, match="wrapped in Keeping"):
+        refuse_running_statistics(adapt(Keeping(kept)))
+
+
+class SubtractsTheMean(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """The commonest running mean: after one observation it is that observation."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.count, self.mean = 0, 0.0
+
+    def observation(self, observation: Any) -> Any:
+        self.count += 1
+        self.mean += (observation - self.mean) / self.count
+        return (observation - self.mean).astype(np.float32)
+
+
+def test_a_running_mean_is_warned_of_at_the_start() -> None:
+    with pytest.warns(UserWarning, match="after resets with the same seed differs"):
+        check_instances(adapt(Plain()), adapt(SubtractsTheMean(Plain())))
+
+
+HARMLESS = [
+    Plain,
+    lambda: wrappers.TimeLimit(Plain(), 10),
+    lambda: wrappers.RecordEpisodeStatistics(Plain()),
+    lambda: wrappers.TransformReward(Plain(), lambda reward: reward / 2),
+    lambda: wrappers.ClipReward(Plain(), -1.0, 1.0),
+    lambda: wrappers.RescaleObservation(Plain(), np.float32(-1), np.float32(1)),
+    lambda: wrappers.FlattenObservation(wrappers.FrameStackObservation(Plain(), 3)),
+    lambda: wrappers.TimeAwareObservation(wrappers.TimeLimit(Plain(), 10), flatten=True),
+    lambda: wrappers.DelayObservation(Plain(), 2),
+    lambda: frozen(Plain()),
+]
+
+
+@pytest.mark.parametrize("make", HARMLESS)
+def test_harmless_wrappers_pass_without_a_word(make: Any) -> None:
+    env, eval_env = adapt(make()), adapt(make())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        refuse_running_statistics(env)
+        check_instances(env, eval_env)
+    assert eval_env.unwrapped.steps == 0  # nothing moves  # type: ignore[attr-defined]
+
+
+class Filter(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """A low-pass filter that nobody clears."""
+
+    seen = 0.0
+
+    def observation(self, observation: Any) -> Any:
+        self.seen = np.float32(0.9) * self.seen + np.float32(0.1) * observation
+        return self.seen
+
+
+class Unseeded(Plain):
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return np.random.default_rng().normal(size=3).astype(np.float32), {}
+
+
+@pytest.mark.parametrize("make", [lambda: Filter(Plain()), Unseeded])
+def test_first_observations_that_depend_on_the_past_are_warned_of(make: Any) -> None:
+    env = adapt(make())
+    with pytest.warns(UserWarning, match="after resets with the same seed differs in 'state'"):
+        check_instances(env, adapt(make()))
+
+
+def test_one_object_for_both_is_warned_of() -> None:
+    robot = Plain()
+    with pytest.warns(UserWarning, match="same environment object"):
+        check_instances(adapt(robot), adapt(wrappers.TimeLimit(robot, 5)))

@@ -1,0 +1,338 @@
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from rich.filesize import decimal
+from safetensors.torch import load_file
+from torch import Tensor
+
+from helpers import flat, wait_for
+from merl import cli
+from merl.agents.ddpg import DDPG, Draws
+from merl.core import Batch
+from merl.report.curves import read_metrics
+from merl.runs.checkpoint import Checkpoint
+from merl.runs.run import Run
+from merl.training.timing import Arithmetic, Timing
+
+pytestmark = pytest.mark.timeout(600)
+_FLAGS = {
+    "--agent": "ddpg",
+    "--preset": "smoke",
+    "--random-steps": 20,
+    "--seed-steps": 20,
+    "--updates-per-step": 0.5,
+    "--threads": 1,
+    "--agent.precision": "fp32",
+    "--agent.hidden-dim": 16,
+    "--save-every": 0,
+    "--eval.every": 1000,
+    "--eval.episodes": 1,
+    "--eval.video": "none",
+}
+SMALL = [*(str(part) for flag in _FLAGS.items() for part in flag), "--eval.no-references"]
+FOLDER = str(Path(__file__).parents[1])
+
+
+@pytest.fixture(autouse=True)
+def _findable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    monkeypatch.setenv("PYTHONPATH", FOLDER, prepend=os.pathsep)
+    monkeypatch.setenv("TURNS", str(tmp_path))
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A run with three environments in processes of their own, and what it printed."""
+    run, out = tmp_path_factory.mktemp("three") / "run", StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out):
+        patch.syspath_prepend(FOLDER)
+        patch.setenv("PYTHONPATH", FOLDER, prepend=os.pathsep)
+        assert train(run, "plain", "--num-envs", "3", steps=150) == 0
+    return run, flat(out.getvalue())
+
+
+@contextmanager
+def started(run: Path, which: str, *flags: str) -> Iterator[subprocess.Popen[str]]:
+    """A run in a process of its own, which does not outlive the test."""
+    line = ["train", f"worker_envs:{which}", *SMALL, "--run-dir", str(run), *flags]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "merl.cli", *line],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def saved(run: Path, beyond: int = 0) -> bool:
+    return any(int(path.name) > beyond for path in run.glob("checkpoints/0*"))
+
+
+def train(run: Path, which: str, *flags: str, steps: int = 100) -> int:
+    line = ["train", f"worker_envs:{which}", *SMALL, "--steps", str(steps)]
+    return cli.main([*line, "--run-dir", str(run), *flags])
+
+
+def weights(run: Path) -> dict[str, object]:
+    last = Checkpoint.find(Run.open(run).checkpoints)
+    return {k: v.tolist() for k, v in load_file(last.path / "weights.safetensors").items()}
+
+
+def test_a_run_with_workers_is_reproducible(
+    tmp_path: Path, three: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hostile = tmp_path / "hostile"  # a working folder whose modules no process imports
+    hostile.mkdir()
+    for name in ("multiprocessing", "pickle", "numpy", "gymnasium"):
+        (hostile / f"{name}.py").write_text("open('imported', 'w')")
+    monkeypatch.chdir(hostile)
+    assert train(tmp_path / "run", "plain", "--num-envs", "3", steps=150) == 0
+    assert not (hostile / "imported").exists()
+    assert weights(tmp_path / "run") == weights(three[0])
+
+
+def test_a_run_beside_its_environment_is_reproducible_and_keeps_its_ratio(tmp_path: Path) -> None:
+    for run in ("one", "other"):
+        assert train(tmp_path / run, "plain", "--no-synchronous", steps=120) == 0
+        check_ratio(tmp_path / run, 120)
+    assert weights(tmp_path / "one") == weights(tmp_path / "other")
+
+
+def test_a_run_with_workers_keeps_its_ratio(three: tuple[Path, str]) -> None:
+    check_ratio(three[0], 150)
+
+
+def check_ratio(run: Path, steps: int) -> None:
+    state = Checkpoint.find(Run.open(run).checkpoints).state()
+    assert state["progress"]["updates"] == (steps - 20) // 2
+    metrics = read_metrics(run)
+    assert np.nanmax(metrics["workers/restarts"]) == 0
+    np.testing.assert_allclose(metrics["train/reward/first"], metrics["train/return"], rtol=1e-6)
+
+
+def test_what_environments_tell_is_not_mixed(tmp_path: Path) -> None:
+    assert train(tmp_path / "run", "uneven", "--num-envs", "2") == 0
+    metrics = read_metrics(tmp_path / "run")
+    assert np.nanmin(metrics["train/return"]) > 0
+    np.testing.assert_allclose(metrics["train/reward/first"], metrics["train/return"], rtol=1e-6)
+
+
+def test_each_worker_meets_other_episodes_and_has_a_lane_of_its_own(
+    three: tuple[Path, str],
+) -> None:
+    seen = [
+        np.fromfile(three[0] / f"replay/{lane}/observation.state.bin", np.float32)
+        for lane in range(3)
+    ]
+    assert all(np.count_nonzero(lane) >= 3 * 50 for lane in seen)
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        assert not np.intersect1d(seen[one][seen[one] != 0], seen[other][seen[other] != 0]).size
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--num-envs", "2", "--no-synchronous"),
+        pytest.param(("--no-synchronous",), marks=pytest.mark.long),
+    ],
+)
+def test_a_run_with_workers_goes_on_as_if_it_had_not_stopped(
+    tmp_path: Path, flags: tuple[str, ...]
+) -> None:
+    """Its environments end their episodes together, so a checkpoint lies between episodes."""
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert train(whole, "plain", *flags, steps=160) == 0
+    with started(parts, "plain", "--steps", "160", *flags) as process:
+        wait_for(lambda: saved(parts, beyond=40), process)
+    assert cli.main(["resume", str(parts)]) == 0
+    assert weights(whole) == weights(parts)
+
+
+@pytest.mark.parametrize("how", ["dies", "hangs", pytest.param("stops", marks=pytest.mark.long)])
+def test_a_worker_that_is_lost_is_started_again(
+    tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TIMES", "1")
+    # On a busy machine one that only is slow must not seem to hang.
+    flags = ["--num-envs", "2", "--worker-timeout", "600" if how == "dies" else "5"]
+    assert train(tmp_path / "run", how, *flags) == 0
+    said = flat(capfd.readouterr().out)
+    assert "starting the environments again (restart 1 of 10)" in said
+    metrics = read_metrics(tmp_path / "run")
+    assert np.nanmax(metrics["workers/restarts"]) == 1
+    assert np.nanmax(metrics["train/length"]) == 10  # the episode that was cut is not counted
+    assert not multiprocessing.active_children()
+
+
+def test_workers_that_are_lost_too_often_end_the_run_with_a_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TIMES", "2")
+    run = tmp_path / "run"
+    assert train(run, "dies", "--no-synchronous", "--worker-restarts", "1") == 4
+    said = flat(capfd.readouterr().err)
+    assert "an environment's process died, after 1 restart: the run is saved at step 48" in said
+    assert Checkpoint.find(Run.open(run).checkpoints).step == 48
+    assert cli.main(["resume", str(run)]) == 0
+    assert Checkpoint.find(Run.open(run).checkpoints).step == 100
+
+
+def test_workers_that_die_before_the_first_step_leave_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert train(run, "stillborn", "--no-synchronous", "--worker-restarts", "0") == 4
+    said = flat(capfd.readouterr().err)
+    assert "after 0 restarts: the run ends before its first step" in said
+    assert "Traceback" not in said
+    assert not run.exists()
+
+
+def test_workers_end_with_the_run_that_is_killed(tmp_path: Path) -> None:
+    flags = ("--steps", "2000000", "--num-envs", "2")
+    with started(tmp_path / "run", "slow", *flags) as process:
+        wait_for(lambda: saved(tmp_path / "run"), process)
+        children = psutil.Process(process.pid).children(recursive=True)
+        assert len(children) >= 2
+        process.kill()
+        _, alive = psutil.wait_procs(children, timeout=300)
+    assert not alive
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGINT,
+        *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGTERM, signal.SIGUSR1)),
+    ],
+)
+def test_a_signal_to_all_processes_saves(tmp_path: Path, number: int) -> None:
+    """A terminal or a batch system sends it to the workers too."""
+    run = tmp_path / "run"
+    with started(run, "slow", "--steps", "2000000", "--num-envs", "2") as process:
+        wait_for(lambda: saved(run), process)
+        os.killpg(process.pid, number)
+        out, _ = process.communicate()
+    assert process.returncode == 128 + number
+    assert "and saved: go on with" in flat(out)
+    assert cli.main(["resume", str(run), "--minutes", "0.02"]) == 0
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+)
+def test_a_signal_while_workers_start_ends_it_at_once(tmp_path: Path, number: int) -> None:
+    run = tmp_path / "run"
+    with started(run, "never_ready", "--steps", "100", "--num-envs", "2") as process:
+        wait_for((tmp_path / "waits").exists, process)
+        process.send_signal(number)
+        out, err = process.communicate()
+    assert process.returncode == 128 + number
+    assert "stopped before training began: nothing was written" in flat(out)
+    assert "Traceback" not in err
+    assert not run.exists()
+
+
+def test_other_processes_of_the_caller_are_left_alone(tmp_path: Path) -> None:
+    bystander = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
+    bystander.start()
+    assert train(tmp_path / "run", "stillborn", "--no-synchronous", "--worker-restarts", "1") == 4
+    assert multiprocessing.active_children() == [bystander]
+    bystander.kill()
+    bystander.join()
+
+
+@pytest.mark.parametrize("flags", [(), ("--no-synchronous",)])
+@pytest.mark.parametrize("which", ["plain", "of_its_own"])
+def test_who_cannot_be_resumed_exactly_is_told(
+    tmp_path: Path, which: str, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", which, *flags) == 0
+    told = "a resumed run will meet other episodes" in flat(capsys.readouterr().out)
+    assert told == (which == "of_its_own")
+
+
+def test_of_several_environments_the_one_is_named_whose_reward_is_no_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", "broken", "--num-envs", "2") == 3
+    error = capsys.readouterr().err
+    assert "the environment's reward is nan at step 50 of environment 1" in error
+
+
+def test_a_signal_is_heeded_between_the_updates_of_a_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learn, made = DDPG.learn, 0
+
+    def signalled(*given: Any) -> Any:
+        nonlocal made
+        made += 1
+        if made == 10:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return learn(*given)
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(DDPG, "learn", signalled)
+        patch.setattr(
+            "merl.training.parts.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
+        )
+        flags = ("--updates-per-step", "50", "--replay.batch-size", "8")
+        assert train(run, "plain", *flags, steps=22) == 128 + signal.SIGTERM
+    state = Checkpoint.find(Run.open(run).checkpoints).state()["progress"]
+    assert (state["step"], state["updates"]) == (21, 10)
+    assert cli.main(["resume", str(run)]) == 0
+    state = Checkpoint.find(Run.open(run).checkpoints).state()["progress"]
+    assert (state["step"], state["updates"]) == (22, 100)
+
+
+def test_what_several_environments_keep_is_told_as_it_is(three: tuple[Path, str]) -> None:
+    run, shown = three
+    taken = sum(file.stat().st_size for file in (run / "replay").rglob("*.bin"))
+    assert f"the replay takes {decimal(taken)} for" in shown
+
+
+def test_an_error_in_another_process_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", "fails", "--num-envs", "2") == 4
+    error = capsys.readouterr().err.strip()
+    assert "step raised LocalError: the gripper is gone (worker_envs.py, line" in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "run").exists()  # it had not begun
+
+
+def test_environments_step_while_the_learner_learns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each step of the environment waits for an update that begins during it."""
+    learn = DDPG.learn
+
+    def told(self: DDPG, batch: Batch, draws: Draws) -> dict[str, Tensor]:
+        (tmp_path / f"learns-{self.step + 1}").touch()
+        return learn(self, batch, draws)
+
+    monkeypatch.setattr(DDPG, "learn", told)
+    flags = ["--no-synchronous", "--updates-per-step", "1", "--worker-timeout", "600"]
+    assert train(tmp_path / "run", "beside", *flags) == 0
+    assert read_metrics(tmp_path / "run")["step"][-1] == 100

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import json
+import random
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from merl.acting.environments import Here, _Worker
+from merl.acting.generators import (
+    global_state,
+    kept_generators,
+    seed_global_generators,
+    set_global_state,
+)
+from merl.acting.run_env import environment_state, set_environment_state
+from toy import DotEnv
+
+MODULES_OWN = np.random.default_rng(1)
+
+
+class Drawing(DotEnv):
+    shared = np.random.RandomState(2)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rng, self.python = np.random.default_rng(3), random.Random(4)
+        self.torch = torch.Generator().manual_seed(5)
+
+    def reset(self, **options: Any) -> Any:
+        self.rng = np.random.default_rng(options["seed"])
+        return super().reset(**options)
+
+    def draw(self) -> list[float]:
+        """A number of every generator that the environment knows."""
+        return [
+            *drawn(),
+            float(self.np_random.normal()),
+            float(self.rng.normal()),
+            self.python.random(),
+            float(torch.rand((), generator=self.torch)),
+            float(self.shared.normal()),
+            float(MODULES_OWN.normal()),
+            float(self.action_space.sample()[0]),
+            float(self.observation_space.sample()["joint"][0]),
+        ]
+
+
+def drawn() -> list[float]:
+    return [
+        float(np.random.normal()),  # noqa: NPY002
+        random.random(),
+        float(torch.rand(())),
+    ]
+
+
+def test_a_seed_decides_the_global_generators() -> None:
+    several = []
+    for seed in (0, 1, 0, 2**32):  # NumPy's takes no more than 32 bits
+        seed_global_generators(seed)
+        several.append(drawn())
+    assert several[0] == several[2]
+    assert not set(several[0]) & set(several[1])
+
+
+def test_the_global_generators_come_back_from_json() -> None:
+    np.random.normal()  # noqa: NPY002 (it keeps the second of two numbers)
+    state = json.loads(json.dumps(global_state()))
+    first = drawn()
+    drawn()
+    set_global_state(state)
+    assert drawn() == first
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_what_an_environment_draws_is_not_moved(wrapped: bool) -> None:
+    env = Drawing()
+    whole: Any = gymnasium.wrappers.TimeLimit(env, 5) if wrapped else env
+    env.reset(seed=7)
+    before, generator = env.draw(), env.rng
+    with kept_generators(whole):
+        expected = env.draw()
+        env.draw()
+    with kept_generators(whole):
+        env.reset(seed=8)
+        env.draw()
+    assert env.rng is generator
+    assert env.draw() == expected
+    assert expected != before
+
+
+def test_an_error_puts_them_back_too() -> None:
+    env = Drawing()
+    env.reset(seed=7)
+    env.draw()  # of the spaces' generators, too, which are made by that
+    with kept_generators(env):
+        expected = env.draw()
+    with pytest.raises(ZeroDivisionError), kept_generators(env):
+        print(env.draw()[0] / 0)
+    assert env.draw() == expected
+
+
+def test_an_environment_state_of_an_earlier_checkpoint_is_restored() -> None:
+    """It had no global generators, or nothing at all."""
+    env = DotEnv()
+    env.reset(seed=3)
+    state = environment_state(env)
+    expected = env.np_random.normal()
+    del state["globals"]
+    set_environment_state(env, state)
+    set_environment_state(env, None)
+    assert env.np_random.normal() == expected
+
+
+def test_the_seed_of_an_episode_seeds_the_global_generators_of_its_process() -> None:
+    env = DotEnv()
+    for environment in (
+        lambda seed: Here(env).reset({0: seed}),
+        lambda seed: _Worker(env, 0).reset(seed=seed),
+    ):
+        seeded = []
+        for seed in (3, 4, 3):
+            environment(seed)
+            seeded.append(drawn())
+        assert seeded[0] == seeded[2] != seeded[1]
+        seed_global_generators(3)
+        environment(None)
+        assert drawn() == seeded[0]
+
+
+@pytest.mark.parametrize(
+    "hold",
+    [lambda rng: [rng], lambda rng: {"noise": rng}, lambda rng: SimpleNamespace(rng=rng)],
+    ids=["list", "dict", "object"],
+)
+def test_generators_in_containers_are_restored(hold: Any) -> None:
+    env, rng = DotEnv(), np.random.default_rng(3)
+    env.kept = hold(rng)  # type: ignore[attr-defined]
+    before = rng.bit_generator.state
+    with kept_generators(env):
+        rng.random(5)
+    assert rng.bit_generator.state == before

@@ -1,0 +1,215 @@
+"""A run's environment gives what its agent consumes and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from merl.acting.run_env import make_run_env, run_spaces
+from merl.agents import AGENTS
+from merl.config import EvaluationConfig, TrainConfig
+from merl.core import EnvironmentFailed, MerlError
+from merl.envs.config import EnvConfig
+from merl.runs.plain import from_plain, to_plain
+from merl.runs.resume import taken_up
+from merl.training.parts import Parts
+from toy import DotEnv
+
+SMALL = EnvConfig(renderer="raster", image_size=32)
+
+
+def test_recorded_config_names_the_renderer_that_draws() -> None:
+    plain = to_plain(TrainConfig("reach_duplo", env=EnvConfig()))["env"]
+    assert plain["renderer"] == "raster"
+    assert from_plain(EnvConfig, plain | {"renderer": "auto"}).renderer == "raster"
+
+
+def test_samples_are_recorded_and_older_records_have_one() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    plain = to_plain(TrainConfig("reach_duplo", env=env))["env"]
+    assert plain["samples"] == 3
+    assert from_plain(EnvConfig, plain) == env
+    del plain["samples"]
+    assert from_plain(EnvConfig, plain) == dataclasses.replace(env, samples=1)
+
+
+def test_resume_refuses_other_samples() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    recorded = TrainConfig("reach_duplo", env=env)
+    other = dataclasses.replace(recorded, env=dataclasses.replace(env, samples=2))
+    with pytest.raises(MerlError, match=r"cannot go on with env.samples 3 -> 2"):
+        taken_up(recorded, other)
+
+
+def test_samples_reach_the_environment_of_a_run() -> None:
+    env = EnvConfig(renderer="raster", image_size=24, samples=3)
+    made = make_run_env(TrainConfig("reach_duplo", env=env))
+    assert made.reset(seed=0)[0]["image"].shape == (24, 24, 3)
+    assert made.unwrapped.config.samples == 3  # type: ignore[attr-defined]
+    made.close()
+
+
+@pytest.mark.parametrize(
+    ("agent", "keys"),
+    [
+        ("merl", {"image", "proprio"}),
+        ("drqv2", {"image"}),
+        ("proprio", {"proprio"}),
+        ("merl_state", {"state"}),
+        ("ddpg", {"state"}),
+        ("sac", {"state"}),
+    ],
+)
+def test_it_gives_what_its_agent_senses(agent: str, keys: set[str]) -> None:
+    config = TrainConfig("reach_duplo", agent_name=agent, agent=AGENTS[agent], env=SMALL)
+    env = make_run_env(config)
+    space, _ = run_spaces(config, env)
+    assert set(space) == set(env.observation_space) == keys  # type: ignore[call-overload]
+    assert set(env.reset(seed=0)[0]) == keys
+    assert env.unwrapped.config.observations == tuple(  # type: ignore[attr-defined]
+        name for name in ("image", "proprio", "state") if name in keys
+    )  # nothing else was computed and thrown away
+    env.close()
+
+
+def test_what_the_critic_is_told_is_there_too() -> None:
+    agent = dataclasses.replace(AGENTS["merl"], critic_vectors=("state",))
+    env = make_run_env(TrainConfig("reach_duplo", agent=agent, env=SMALL))
+    assert set(env.reset(seed=0)[0]) == {"image", "proprio", "state"}
+    env.close()
+
+
+def test_the_dot_is_narrowed_as_well() -> None:
+    config = TrainConfig("merl.envs.dot:whole", agent_name="drqv2", agent=AGENTS["drqv2"])
+    env = make_run_env(config)
+    assert set(env.observation_space) == set(env.reset(seed=0)[0]) == {"image"}  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            {"vectors": ("proprio",), "critic_vectors": ("proprio",)},
+            "which the actor has already",
+        ),
+        ({"images": (), "critic_vectors": ("proprio",)}, "leaves the actor nothing"),
+        ({"critic_vectors": ("touch",)}, "agent.critic-vectors names 'touch'"),
+        ({"critic_vectors": ("state",), "fusion": "shared"}, "use --agent.fusion decoupled"),
+        (
+            {"images": ("wrist",)},
+            r"agent.images names 'wrist', but the environment gives \['image'",
+        ),
+        ({"images": (), "vectors": ()}, "finds nothing to sense"),
+    ],
+)
+def test_what_does_not_fit_is_named(change: dict, says: str) -> None:  # type: ignore[type-arg]
+    agent = dataclasses.replace(AGENTS["merl"], **change)
+    with pytest.raises(MerlError, match=says):
+        make_run_env(TrainConfig("reach_duplo", agent=agent, env=SMALL))
+
+
+class Greedy(DotEnv):
+    """Installs a handler of its own for Ctrl-C in every method."""
+
+    def __init__(self) -> None:
+        signal.signal(signal.SIGINT, lambda *_: None)
+        super().__init__()
+
+    def reset(self, **options: Any) -> Any:
+        signal.signal(signal.SIGINT, lambda *_: None)
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        signal.signal(signal.SIGINT, lambda *_: None)
+        raise OSError("the arm is gone")
+
+    def render(self) -> Any:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def close(self) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        raise KeyboardInterrupt
+
+
+def greedy() -> DotEnv:
+    return Greedy()
+
+
+def test_signal_handlers_are_put_back_after_every_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    config = TrainConfig("test_run_env:greedy", agent=AGENTS["merl"])
+    env: Any = None
+
+    def make() -> None:
+        nonlocal env
+        env = make_run_env(config)
+
+    def step() -> None:
+        with pytest.raises(EnvironmentFailed, match="the arm is gone"):
+            env.step(np.zeros(1, np.float32))
+
+    def close() -> None:
+        with pytest.warns(UserWarning, match="was interrupted"):
+            env.close()
+
+    mine = signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        before = signal.getsignal(signal.SIGINT)
+        for call in (make, lambda: env.reset(seed=0), step, lambda: env.render(), close):
+            call()
+            assert signal.getsignal(signal.SIGINT) is before
+    finally:
+        signal.signal(signal.SIGINT, mine)
+
+
+def test_evaluations_start_where_they_are_asked_to() -> None:
+    trained = TrainConfig(
+        "move_box",
+        agent_name="merl_state",
+        agent=AGENTS["merl_state"],
+        env=dataclasses.replace(SMALL, start=("around", "holding")),
+    )
+    assert trained.evaluated == trained
+    config = dataclasses.replace(trained, eval=EvaluationConfig(start=("above",)))
+    assert config.evaluated.env == dataclasses.replace(trained.env, start=("above",))
+    assert from_plain(EvaluationConfig, to_plain(config)["eval"]) == config.eval
+    heights = {}
+    for name, each in (("trained", config), ("evaluated", config.evaluated)):
+        env = make_run_env(each)
+        try:
+            env.reset(seed=0)
+            inner: Any = env.unwrapped
+            heights[name] = inner.task.tool_center_point(inner.physics)[2]
+        finally:
+            env.close()
+    assert heights["trained"] < 0.15 < heights["evaluated"]
+
+
+def test_starts_of_evaluations_are_refused_where_there_are_none() -> None:
+    with pytest.raises(MerlError, match=r"eval\.start .* my_env:make decides where it starts"):
+        TrainConfig("my_env:make", eval=EvaluationConfig(start=("above",)))
+    with pytest.raises(MerlError, match="start"):
+        TrainConfig("move_box", eval=EvaluationConfig(start=()))
+
+
+def test_a_run_evaluates_in_the_environment_that_its_evaluations_start_in(tmp_path: Path) -> None:
+    config = TrainConfig(
+        "move_box",
+        agent_name="merl_state",
+        agent=dataclasses.replace(AGENTS["merl_state"], precision="fp32", hidden_dim=16),
+        env=dataclasses.replace(SMALL, start=("around",)),
+        eval=EvaluationConfig(start=("above",), video="none"),
+        steps=300,
+        threads=1,
+        run_dir=tmp_path / "run",
+    )
+    with Parts.prepare(config, new=True) as parts:
+        trained: Any = parts.env.unwrapped
+        assert parts.eval_env is not None
+        evaluated: Any = parts.eval_env.unwrapped
+        assert (trained.config.start, evaluated.config.start) == (("around",), ("above",))

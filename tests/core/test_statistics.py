@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from merl.core.statistics import Interval, bootstrap_interval, wilson_interval
+
+
+def test_bootstrap_of_two_values_by_hand():
+    # Resampled means: 0 with 1/4, 0.5 with 1/2, 1 with 1/4.
+    assert bootstrap_interval([0.0, 1.0]) == Interval(0.5, 0.0, 1.0)
+    assert bootstrap_interval([0.0, 1.0], level=0.4) == Interval(0.5, 0.5, 0.5)
+
+
+def test_bootstrap_of_three_values_by_hand():
+    # Resampled means 0, 1, 2, 3 with 8/27, 12/27, 6/27, 1/27: up to 2 lies 96.3 %.
+    assert bootstrap_interval([0.0, 0.0, 3.0]) == Interval(1.0, 0.0, 3.0)
+    assert bootstrap_interval([0.0, 0.0, 3.0], level=0.9) == Interval(1.0, 0.0, 2.0)
+
+
+def test_bootstrap_approaches_the_normal_interval():
+    values = np.random.default_rng(1).normal(100, 20, 400)
+    interval = bootstrap_interval(values)
+    half = 1.96 * values.std() / 20
+    assert interval.low == pytest.approx(interval.mean - half, abs=0.2)
+    assert interval.high == pytest.approx(interval.mean + half, abs=0.2)
+
+
+def test_bootstrap_repeats_with_its_seed():
+    values = np.random.default_rng(2).normal(size=20)
+    assert bootstrap_interval(values, seed=3) == bootstrap_interval(values, seed=3)
+    assert bootstrap_interval(values, seed=3) != bootstrap_interval(values, seed=4)
+
+
+@pytest.mark.parametrize("values", [[0.1], [0.1] * 7])
+def test_bootstrap_without_spread_has_no_width(values):
+    assert bootstrap_interval(values) == Interval(0.1, 0.1, 0.1)
+
+
+@pytest.mark.parametrize("values", [[], [1.0, float("nan")], [float("inf")]])
+def test_bootstrap_refuses_what_has_no_mean(values):
+    with pytest.raises(ValueError, match="finite"):
+        bootstrap_interval(values)
+
+
+@pytest.mark.parametrize(("successes", "n"), [(0, 10), (3, 10), (25, 50), (10, 10), (1, 1)])
+def test_wilson_against_its_formula(successes, n):
+    z, p = 1.959963984540054, successes / n
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    interval = wilson_interval(successes, n)
+    assert interval == pytest.approx((p, centre - half, centre + half), abs=1e-9)
+
+
+def test_wilson_of_no_success_by_hand():
+    # z^2 / (n + z^2) = 3.8415 / 13.8415
+    assert wilson_interval(0, 10) == pytest.approx((0.0, 0.0, 0.27753), abs=1e-5)
+
+
+@pytest.mark.parametrize(("successes", "n"), [(0, 0), (-1, 5), (6, 5)])
+def test_wilson_refuses_impossible_counts(successes, n):
+    with pytest.raises(ValueError, match="trials"):
+        wilson_interval(successes, n)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, 95])
+def test_a_level_is_a_fraction(level):
+    with pytest.raises(ValueError, match="level"):
+        bootstrap_interval([1.0, 2.0], level=level)
+    with pytest.raises(ValueError, match="level"):
+        wilson_interval(1, 2, level=level)

@@ -1,0 +1,291 @@
+from __future__ import annotations
+
+import json
+import logging
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from merl.agents import make_agent
+from merl.agents.config import AgentConfig
+from merl.agents.ddpg import DDPG
+from merl.agents.merl import MERLConfig
+from merl.agents.sac import SACConfig
+from merl.core import Batch, MerlError
+from merl.runs.checkpoint import Checkpoint, _fingerprint, load_agent, save
+from toy import DotEnv
+
+CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")
+
+
+def agent(seed: int = 0, config: AgentConfig = CONFIG) -> DDPG:
+    env = DotEnv()
+    return make_agent(
+        config,
+        env.observation_space,
+        env.action_space,
+        frame_stack=3,
+        seed=seed,
+        device=torch.device("cpu"),
+    )
+
+
+def batch_of(of: DDPG) -> Batch:
+    generator = torch.Generator().manual_seed(0)
+    observation = {
+        "image": torch.randint(0, 256, (4, 3, 16, 16, 3), dtype=torch.uint8, generator=generator),
+        "joint": torch.randn(4, 2, generator=generator),
+    }
+    action, rest = torch.rand(4, 1, generator=generator), torch.ones(4)
+    return Batch(observation, action, rest, rest, observation)
+
+
+def weights(of: DDPG) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in of.networks.parameters()])
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        CONFIG,
+        replace(CONFIG, fusion="shared"),
+        replace(CONFIG, fusion="shared_by_both", target="heads_and_fusion"),
+        replace(CONFIG, latent_dim=0),
+        SACConfig(images=None, vectors=None, hidden_dim=16, precision="bf16"),
+    ],
+    ids=lambda config: f"{type(config).__name__}-{config.fusion}-{config.latent_dim}",
+)
+def test_round_trip(tmp_path: Path, config: AgentConfig) -> None:
+    saved, other = agent(0, config), agent(1, config)
+    for one in (saved, other):
+        one.update(batch_of(one))
+    save(tmp_path, 250, saved, {"a": 1}, score=2.5, keep=2)
+    found = Checkpoint.find(tmp_path)
+    load_agent(other, found)
+    assert (found.step, found.score, found.state()) == (250, 2.5, {"a": 1})
+    assert torch.equal(weights(saved), weights(other))
+    assert torch.equal(saved.learning.get_state(), other.learning.get_state())
+    for one in (saved, other):
+        one.update(batch_of(one))
+    assert torch.equal(weights(saved), weights(other))
+
+
+def test_a_hundred_million_steps_come_after_ninety_nine(tmp_path: Path) -> None:
+    for step in (99_990_000, 99_995_000, 100_000_000):
+        save(tmp_path, step, agent(), {}, score=None, keep=2)
+    assert Checkpoint.find(tmp_path).step == 100_000_000
+    assert not (tmp_path / "99990000").exists()
+
+
+def test_keeps_the_last_and_the_best(tmp_path: Path) -> None:
+    for step, score in ((100, 1.0), (200, 9.0), (300, None), (400, 3.0), (500, None)):
+        save(tmp_path, step, agent(), {}, score=score, keep=2)
+    assert sorted(int(path.name) for path in tmp_path.iterdir()) == [200, 400, 500]
+    assert Checkpoint.find(tmp_path, "best").step == 200
+    assert Checkpoint.find(tmp_path, "latest").step == 500
+    assert Checkpoint.find(tmp_path, "400").step == 400
+
+
+def test_a_second_save_at_a_step_replaces_the_first(tmp_path: Path) -> None:
+    save(tmp_path, 100, agent(), {"a": 1}, score=None, keep=1)
+    save(tmp_path, 100, agent(), {"a": 2}, score=3.0, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["00000100"]
+    found = Checkpoint.find(tmp_path)
+    assert (found.score, found.state()) == (3.0, {"a": 2})
+
+
+def test_a_second_save_that_fails_at_the_last_moment_leaves_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path, 100, agent(), {"a": 1}, score=None, keep=1)
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if self.name == ".part-00000100":
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OSError, match="Input/output"):
+        save(tmp_path, 100, agent(), {"a": 2}, score=None, keep=1)
+    assert Checkpoint.find(tmp_path).state() == {"a": 1}
+
+
+def test_going_on_from_before_a_damaged_one_never_loses_the_good_ones(tmp_path: Path) -> None:
+    for step in (100, 300):
+        save(tmp_path, step, agent(), {}, score=float(step), keep=2)
+    (tmp_path / "00000300" / "learner.pt").write_bytes(b"")
+    (tmp_path / ".part-00000400").mkdir()
+    assert Checkpoint.find(tmp_path).step == 100
+    save(tmp_path, 200, agent(), {}, score=None, keep=1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000100", "00000200"]
+    assert Checkpoint.find(tmp_path).step == 200
+
+
+def test_a_checkpoint_of_another_device_loads(tmp_path: Path) -> None:
+    """CUDA's generators have a state of 16 bytes; the noise then starts anew."""
+    saved, other, twin = agent(0), agent(1), agent(1)
+
+    class OnCuda:
+        @staticmethod
+        def state_dict() -> dict[str, object]:
+            small = torch.zeros(16, dtype=torch.uint8)
+            return saved.state_dict() | {"acting": small, "learning": small}
+
+    save(tmp_path, 1, OnCuda(), {}, score=None, keep=1)  # type: ignore[arg-type]
+    load_agent(other, Checkpoint.find(tmp_path))
+    assert torch.equal(weights(saved), weights(other))
+    assert torch.equal(other.acting.get_state(), twin.acting.get_state())
+
+
+def test_a_checkpoint_that_was_written_on_cuda_goes_on_here(tmp_path: Path) -> None:
+    """Its tensors are told to lie on cuda:0, and its Adam to be one for CUDA graphs."""
+    saved, other = agent(0), agent(1)
+    saved.update(batch_of(saved))
+    for optimizer in (saved.critic_optimizer, saved.actor_optimizer):
+        optimizer.param_groups[0]["capturable"] = True
+    save(tmp_path, 1, saved, {}, score=None, keep=1)
+    folder = tmp_path / "00000001"
+    file = folder / "learner.pt"
+    tell_that_it_lies_on_cuda(file)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"][file.name] = _fingerprint(file)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(RuntimeError, match="CUDA"):
+        torch.load(file, weights_only=True)
+    load_agent(other, Checkpoint.find(tmp_path))
+    assert not other.critic_optimizer.param_groups[0]["capturable"]
+    for optimizer in (saved.critic_optimizer, saved.actor_optimizer):
+        optimizer.param_groups[0]["capturable"] = False
+    for learner in (saved, other):
+        learner.learning.manual_seed(0)
+        learner.update(batch_of(learner))
+    assert torch.equal(weights(saved), weights(other))
+
+
+def tell_that_it_lies_on_cuda(file: Path) -> None:
+    with zipfile.ZipFile(file) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, part in parts.items():
+            archive.writestr(name, part.replace(b"X\x03\0\0\0cpu", b"X\x06\0\0\0cuda:0"))
+
+
+@pytest.mark.parametrize("name", ["weights.safetensors", "learner.pt", "state.json"])
+@pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "remove"])
+def test_a_damaged_file_is_passed_over(
+    tmp_path: Path, name: str, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    for step in (100, 200):
+        save(tmp_path, step, agent(), {"step": step}, score=None, keep=2)
+    file = tmp_path / "00000200" / name
+    data = bytearray(file.read_bytes())
+    if damage == "flip":
+        data[len(data) // 2] ^= 1
+    elif damage == "truncate":
+        data = data[:-1]
+    elif damage == "empty":
+        data = bytearray()
+    file.write_bytes(data)
+    if damage == "remove":
+        file.unlink()
+    with caplog.at_level(logging.WARNING):
+        assert Checkpoint.find(tmp_path).step == 100
+    assert name in caplog.text
+    with pytest.raises(MerlError, match=name):
+        Checkpoint.find(tmp_path, "200")
+
+
+def test_none_at_all_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(MerlError, match="no whole checkpoint"):
+        Checkpoint.find(tmp_path)
+    with pytest.raises(MerlError, match="not there"):
+        Checkpoint.find(tmp_path, "300")
+
+
+def test_an_unknown_format_is_refused(tmp_path: Path) -> None:
+    save(tmp_path, 1, agent(), {}, score=None, keep=1)
+    manifest = tmp_path / "00000001" / "manifest.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"format": 99}))
+    with pytest.raises(MerlError, match="format 99"):
+        Checkpoint.open(tmp_path / "00000001")
+
+
+def test_other_networks_are_refused(tmp_path: Path) -> None:
+    save(tmp_path, 1, agent(), {}, score=None, keep=1)
+    wider = agent(config=MERLConfig(latent_dim=8, hidden_dim=32, precision="fp32"))
+    with pytest.raises(MerlError, match="cannot be loaded"):
+        load_agent(wider, Checkpoint.find(tmp_path))
+
+
+def test_a_failed_save_leaves_the_former_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path, 100, agent(), {}, score=None, keep=1)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space"):
+        save(tmp_path, 200, agent(), {}, score=None, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["00000100"]
+    assert Checkpoint.find(tmp_path).step == 100
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "{", "[" * 100_000], ids=lambda text: text[:30])
+def test_a_state_of_another_form_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
+    saved = save(tmp_path / "run", 1, agent(), {}, score=None, keep=1)
+    (saved.path / "state.json").write_text(content)
+    with pytest.raises(MerlError, match="cannot be loaded") as caught:
+        saved.state()
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"files": []},
+        {"files": {}},
+        {"files": {"../../weights.safetensors": {}}},
+        {"step": float("inf")},
+        {"step": -5},
+        {"score": "x"},
+        {"score": [1]},
+    ],
+    ids=str,
+)
+def test_a_manifest_of_another_form_is_refused_in_one_line(
+    tmp_path: Path, change: dict[str, object]
+) -> None:
+    saved = save(tmp_path / "run", 1, agent(), {}, score=None, keep=1)
+    manifest = saved.path / "manifest.json"
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), **change}))
+    with pytest.raises(MerlError, match="no readable manifest") as caught:
+        Checkpoint.open(saved.path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_folder_that_only_looks_like_a_number_is_no_checkpoint(tmp_path: Path) -> None:
+    save(tmp_path, 1, agent(), {}, score=None, keep=1)
+    (tmp_path / "\N{SUPERSCRIPT TWO}").mkdir()
+    assert Checkpoint.find(tmp_path).step == 1
+
+
+def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
+    import pickle
+
+    class Evil:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return Path.touch, (Path(tmp_path / "owned"),)  # type: ignore[return-value]
+
+    saved = save(tmp_path / "run", 1, agent(), {}, score=None, keep=1)
+    for content in (pickle.dumps(Evil()), pickle.dumps(3), b"", b"PK\x03\x04"):
+        (saved.path / "learner.pt").write_bytes(content)
+        with pytest.raises(MerlError, match=r"cannot be loaded: learner\.pt holds") as caught:
+            load_agent(agent(), saved)
+        assert "weights_only" not in str(caught.value)  # torch advises to switch it off
+    assert not (tmp_path / "owned").exists()

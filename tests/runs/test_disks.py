@@ -1,0 +1,175 @@
+"""Disks that are full, or not to be written to: small ones, mounted where nobody else sees them."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import psutil
+import pytest
+from test_recovery import EPISODE, line, saved, start
+
+from helpers import wait_for
+from merl.cli import main
+from merl.report.curves import read_metrics
+from merl.runs import checkpoint
+from merl.runs.checkpoint import Checkpoint
+
+SIZE = 24 * 2**20
+"""Of the disk, in bytes: a few checkpoints of the dot, its replay and its videos."""
+ALONE = ["unshare", "--map-root-user", "--mount"]
+
+
+def can_mount(folder: Path) -> bool:
+    mount = [*ALONE, "mount", "-t", "tmpfs", "tmpfs", str(folder)]
+    try:
+        return subprocess.run(mount, capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize("which", ["full", "full_to_the_end", "read_only"])
+def test_a_disk(which: str, tmp_path: Path) -> None:
+    if not can_mount(tmp_path):
+        pytest.skip("this system lets nobody mount a disk of their own")
+    alone = subprocess.run(
+        [*ALONE, sys.executable, __file__, which, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=900,
+    )
+    assert alone.returncode == 0, alone.stdout + alone.stderr
+
+
+def read_only(folder: Path) -> None:
+    """Refused before anything is timed or built, and by name; what is there can be evaluated."""
+    mount(folder)
+    assert main(line(folder / "run", "--steps", "100")) == 0
+    mount(folder, "remount,ro")
+    for arguments in (line(folder / "other"), ["resume", str(folder / "run"), "--steps", "200"]):
+        process = start(arguments)
+        _, err = process.communicate()
+        assert process.returncode == 2, err
+        assert err.count("\n") == 1
+        assert "Read-only file system" in err
+        assert str(folder) in err
+    assert main(["evaluate", str(folder / "run"), "--episodes", "1"]) == 0
+
+
+def fill(folder: Path) -> Path:
+    """Leave no byte."""
+    filler = folder / "filler"
+    with filler.open("ab", buffering=0) as file:
+        for size in (2**20, 4096, 1):
+            try:
+                while True:
+                    file.write(bytes(size))
+            except OSError as error:
+                if error.errno != errno.ENOSPC:
+                    raise
+    return filler
+
+
+def mount(folder: Path, options: str = f"size={SIZE}") -> None:
+    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], check=True)
+
+
+def full(folder: Path) -> None:
+    """The run goes on, says what was not written, and has lost nothing once there is room."""
+    mount(folder)
+    run = folder / "run"
+    often = ["--eval.every", "60", "--eval.video", "each"]
+    process = start(line(run, *often, "--steps", "1000000", "--replay.capacity", "1000"))
+    assert process.stdout is not None
+    wait_for(lambda: len(saved(run)) > 1, process)
+    filler = fill(folder)
+    before = saved(run)[-1]
+    told = []
+    for said in process.stdout:
+        told.append(said)
+        if "was not written" in said:
+            break
+    times = psutil.Process(process.pid).cpu_times
+    worked = times().user  # it goes on, and keeps what it has to say
+    wait_for(lambda: times().user > worked + 1.0, process)
+    filler.unlink()
+    wait_for(lambda: saved(run)[-1] > before, process)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM, err
+    assert "Traceback" not in err
+
+    last = Checkpoint.find(run / "checkpoints").step
+    assert last > before
+    assert main(["resume", str(run), "--steps", str(last + 2 * EPISODE)]) == 0
+    steps = read_metrics(run)["step"]
+    assert (np.diff(steps) < 2 * EPISODE).all(), "a row is missing"  # one episode was cut off
+    assert steps[0] == EPISODE
+    print("".join(told), out)
+
+
+def full_to_the_end(folder: Path) -> None:
+    """The end is not saved, which the exit code tells; the run is resumed once there is room."""
+    mount(folder)
+    run, output, steps = folder / "run", io.StringIO(), 240
+    write = checkpoint.save
+
+    def save_and_fill(*args: Any, **kwargs: Any) -> Any:
+        saved = write(*args, **kwargs)
+        if saved.step == 4 * EPISODE:
+            fill(folder)
+        return saved
+
+    often = [
+        "--eval.video",
+        "each",
+        "--steps",
+        str(steps),
+        "--replay.capacity",
+        "70",
+    ]  # which is overwritten meanwhile
+    with (
+        mock.patch.object(checkpoint, "save", save_and_fill),
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(output),
+    ):
+        code = main(line(run, *often))
+    told = output.getvalue()
+    assert code == 5, told
+    last = told.splitlines()[-1]
+    # The last page of metrics.csv may have room for some rows.
+    lost = rf"ended at step {steps}, but its checkpoint( and \d+ rows of its metrics)? could not"
+    assert re.search(lost, last), told
+    assert last.endswith(f"`merl resume {run}` continues from step {4 * EPISODE}")
+    assert "Traceback" not in told
+    assert saved(run) == [3 * EPISODE, 4 * EPISODE]
+
+    (folder / "filler").unlink()
+    assert main(["resume", str(run)]) == 0
+    assert saved(run)[-1] == steps
+    assert (np.diff(read_metrics(run)["step"]) == EPISODE).all(), "a row is missing"
+    assert full_from_the_start(folder) == 2
+
+
+def full_from_the_start(folder: Path) -> int:
+    """Where no checkpoint can be written nothing is begun, and nothing is left."""
+    error = OSError(errno.ENOSPC, "No space left on device")
+    with mock.patch.object(checkpoint, "save", side_effect=error):
+        code = main(line(folder / "none"))
+    assert not (folder / "none").exists()
+    return code
+
+
+if __name__ == "__main__":
+    kinds = {"full": full, "full_to_the_end": full_to_the_end, "read_only": read_only}
+    kinds[sys.argv[1]](Path(sys.argv[2]))

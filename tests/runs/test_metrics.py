@@ -1,0 +1,284 @@
+import csv
+import errno
+import io
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from merl.core import MerlError
+from merl.report.curves import read_metrics
+from merl.runs import metrics
+from merl.runs.metrics import MetricsWriter
+
+
+def rows(run):
+    with (run / "metrics.csv").open(newline="") as file:
+        return [*csv.reader(file)]
+
+
+def scalars(run, name):
+    accumulator = EventAccumulator(str(run / "tensorboard"))
+    accumulator.Reload()
+    return [(event.step, event.value) for event in accumulator.Scalars(name)]
+
+
+def test_a_row_per_step(tmp_path):
+    with MetricsWriter(tmp_path / "run") as writer:
+        writer.write(250, {"train/return": 1.5})
+        writer.write(500, {"train/return": np.float32(0.25)})
+    assert rows(tmp_path / "run") == [["step", "train/return"], ["250", "1.5"], ["500", "0.25"]]
+
+
+def test_numbers_come_back_exactly(tmp_path):
+    value = 0.1 + 0.2
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(1, {"a": value, "b": float("nan"), "c": 1e-300})
+    back = read_metrics(tmp_path)
+    assert back["a"][0] == value
+    assert np.isnan(back["b"][0])
+    assert back["c"][0] == 1e-300
+
+
+def test_a_column_may_come_later(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(1, {"a": 1.0})
+        writer.write(2, {"b, c": 2.0})
+        writer.write(3, {"a": 3.0})
+    assert rows(tmp_path) == [
+        ["step", "a", "b, c"],
+        ["1", "1.0", ""],
+        ["2", "", "2.0"],
+        ["3", "3.0", ""],
+    ]
+
+
+def test_a_step_has_one_row(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(0, {"a": 1.0, "b": 1.0})
+        writer.write(1, {"a": 1.23456789, "b": 1.23456789})
+        writer.write(1, {"a": 2.0, "b": 2.0})  # shorter: nothing of the longer line may remain
+        assert rows(tmp_path)[1:] == [["0", "1.0", "1.0"], ["1", "2.0", "2.0"]]
+        writer.write(1, {"c": 3.0})
+        writer.write(2, {"a": 4.0})
+        writer.write(2, {"b": 5.0})
+    assert rows(tmp_path) == [
+        ["step", "a", "b", "c"],
+        ["0", "1.0", "1.0", ""],
+        ["1", "2.0", "2.0", "3.0"],
+        ["2", "4.0", "5.0", ""],
+    ]
+
+
+def test_a_row_is_on_disk_when_write_returns(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        for step in range(3):
+            writer.write(step, {"a": 0.5})
+            assert rows(tmp_path)[-1] == [str(step), "0.5"]
+            assert (tmp_path / "metrics.csv").read_bytes().endswith(b"\n")
+
+
+def test_refuses_a_step_back_and_names_that_are_no_columns(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(10, {"a": 1.0})
+        with pytest.raises(ValueError, match=r"trim\(9\)"):
+            writer.write(9, {"a": 1.0})
+        for name in ("", "step", "two\nlines"):
+            with pytest.raises(ValueError, match="named"):
+                writer.write(11, {name: 1.0})
+    assert rows(tmp_path) == [["step", "a"], ["10", "1.0"]]
+    with pytest.raises(ValueError, match="closed"):
+        writer.write(12, {"a": 1.0})
+
+
+def test_goes_on_where_it_stopped(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(1, {"a": 1.0})
+    with MetricsWriter(tmp_path) as writer:
+        assert writer.last_step == 1
+        writer.write(1, {"b": 2.0})
+        writer.write(2, {"b": 3.0})
+    assert rows(tmp_path) == [["step", "a", "b"], ["1", "1.0", "2.0"], ["2", "", "3.0"]]
+
+
+@pytest.mark.parametrize("torn", ["3", "3,1.0", "\0\0\0\0"])
+def test_goes_on_after_a_torn_line(tmp_path, torn):
+    (tmp_path / "metrics.csv").write_text("step,a\n1,1.0\n2,2.0\n" + torn)
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(3, {"a": 3.5})
+    assert rows(tmp_path)[1:] == [["1", "1.0"], ["2", "2.0"], ["3", "3.5"]]
+
+
+def test_survives_a_kill(tmp_path):
+    code = (
+        "import os, signal, sys\n"
+        "from merl.runs.metrics import MetricsWriter\n"
+        "writer = MetricsWriter(sys.argv[1])\n"
+        "for step in range(5): writer.write(step, {'a': step})\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, tmp_path], check=False)
+    assert [row[0] for row in rows(tmp_path)[1:]] == ["0", "1", "2", "3", "4"]
+    assert len(scalars(tmp_path, "a")) == 5
+
+
+def test_trim_leaves_no_step_twice(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        for step in (100, 200, 201, 300):
+            writer.write(step, {"a": step})
+    with MetricsWriter(tmp_path) as writer:
+        writer.trim(200)
+        assert [row[0] for row in rows(tmp_path)] == ["step", "100", "200"]
+        assert writer.last_step == 200
+        for step in (250, 300):
+            writer.write(step, {"a": -step})
+    expected = [(100, 100), (200, 200), (250, -250), (300, -300)]
+    back = read_metrics(tmp_path)
+    assert [*zip(back["step"], back["a"], strict=True)] == expected
+    assert scalars(tmp_path, "a") == expected
+
+
+def test_trim_to_before_the_first_row(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(100, {"a": 1.0})
+        writer.trim(0)
+        assert writer.last_step is None
+        writer.write(50, {"a": 2.0})
+    assert rows(tmp_path) == [["step", "a"], ["50", "2.0"]]
+
+
+def test_tensorboard_shows_the_same(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(1, {"train/return": 1.5, "eval/success": 0.5})
+        writer.write(2, {"train/return": 2.5})
+    assert scalars(tmp_path, "train/return") == [(1, 1.5), (2, 2.5)]
+    assert scalars(tmp_path, "eval/success") == [(1, 0.5)]
+
+
+def test_prints_nothing_and_leaves_tensorflow_alone(tmp_path):
+    (tmp_path / "tensorflow.py").write_text("raise SystemExit('TensorFlow was imported')")
+    code = (
+        "import sys\n"
+        "from merl.runs.metrics import MetricsWriter\n"
+        "with MetricsWriter(sys.argv[1]) as writer: writer.write(1, {'a': 1.0})\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "default", "-c", code, tmp_path / "run"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("text", ["a,b\n1,2\n", "step,a\n1\n", "step,a\n2,1\n1,1\n", "step\nx\n"])
+def test_never_overwrites_what_it_cannot_read(tmp_path, text):
+    path = tmp_path / "metrics.csv"
+    path.write_text(text)
+    with pytest.raises(MerlError, match=r"metrics\.csv"):
+        MetricsWriter(tmp_path)
+    assert path.read_text() == text
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_an_interrupt_between_memory_and_file_loses_no_row(tmp_path, monkeypatch):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(1, {"a": 1.0})
+        with monkeypatch.context() as patch:
+            patch.setattr(metrics, "_write_whole", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                writer.write(2, {"a": 2.0})
+        writer.write(2, {"a": 3.0})
+    assert rows(tmp_path) == [["step", "a"], ["1", "1.0"], ["2", "3.0"]]
+
+
+class FullDisk(io.FileIO):
+    """Takes a few bytes of what is written, then none, while `full`."""
+
+    full = False
+
+    def write(self, data):
+        if not FullDisk.full:
+            return super().write(data)
+        if len(data) > 3:
+            return super().write(bytes(data)[:3])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    """A disk that can be made full."""
+    FullDisk.full = False
+    monkeypatch.setattr(metrics.io, "FileIO", FullDisk)
+    real_open = Path.open
+
+    def open_unless_full(path, mode="r", *args, **kwargs):
+        if FullDisk.full and "w" in mode:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real_open(path, mode, *args, **kwargs)
+
+    monkeypatch.setattr(Path, "open", open_unless_full)
+    return FullDisk
+
+
+def test_a_full_disk_does_not_end_a_run(tmp_path, disk):
+    told = []
+    with MetricsWriter(tmp_path, warn=told.append) as writer:
+        writer.write(1, {"a": 1.0})
+        disk.full = True
+        writer.write(2, {"a": 2.0})
+        assert rows(tmp_path) == [["step", "a"], ["1", "1.0"]]  # and no piece of the second row
+        writer.write(3, {"a": 3.0, "b": 3.0})
+        writer.trim(2)
+        writer.write(4, {"a": 4.0})
+        assert len(told) == 1
+        assert "No space left on device" in told[0]
+        assert "\n" not in told[0]
+        disk.full = False
+        writer.write(5, {"a": 5.0})
+    assert rows(tmp_path) == [
+        ["step", "a", "b"],
+        ["1", "1.0", ""],
+        ["2", "2.0", ""],
+        ["4", "4.0", ""],
+        ["5", "5.0", ""],
+    ]
+    assert scalars(tmp_path, "a") == [(1, 1.0), (5, 5.0)]
+    assert len(told) == 1
+
+
+def test_a_disk_that_is_full_from_the_start_until_the_end(tmp_path, disk, caplog):
+    disk.full = True
+    with caplog.at_level(logging.WARNING), MetricsWriter(tmp_path) as writer:
+        writer.write(1, {"a": 1.0})
+        disk.full = False
+    assert len(caplog.records) == 1
+    assert rows(tmp_path) == [["step", "a"], ["1", "1.0"]]  # `close` has brought it there
+    assert [path.name for path in tmp_path.glob(".*")] == []
+
+
+def test_rows_that_are_not_on_the_disk_are_counted(tmp_path, disk):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(1, {"a": 1.0})
+        assert writer.unwritten == 0
+        disk.full = True
+        for step in (1, 2, 3):
+            writer.write(step, {"a": 2.0})
+            assert writer.unwritten == step
+        writer.trim(2)
+        assert writer.unwritten == 2
+        disk.full = False
+        writer.write(4, {"b": 1.0})
+        assert writer.unwritten == 0
+        disk.full = True
+        writer.write(5, {"b": 1.0})
+    assert writer.unwritten == 1

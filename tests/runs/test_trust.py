@@ -1,0 +1,285 @@
+"""A run folder from a stranger: opening, evaluating and resuming it imports nothing of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from gymnasium import spaces
+
+import merl
+from merl.cli import main
+from merl.core import MerlError
+from merl.envs.own import imports_code, load_module, module_folder
+from merl.runs import trust
+from merl.runs.run import Run
+from merl.runs.trust import Origin
+
+TOY = """
+import gymnasium
+from gymnasium import spaces
+
+
+class Arm(gymnasium.Env):
+    observation_space = spaces.Dict({"state": spaces.Box(-1, 1, (2,))})
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.taken = 0
+        return self.see(), {}
+
+    def step(self, action):
+        self.taken += 1
+        return self.see(), 1.0, False, self.taken == 10, {}
+
+    def see(self):
+        return {"state": self.np_random.uniform(-1, 1, 2).astype("float32")}
+
+
+def make():
+    return Arm()
+"""
+_FLAGS = {
+    "--agent": "ddpg",
+    "--preset": "smoke",
+    "--steps": 20,
+    "--random-steps": 10,
+    "--seed-steps": 10,
+    "--replay.batch-size": 8,
+    "--threads": 1,
+    "--agent.precision": "fp32",
+    "--agent.hidden-dim": 8,
+    "--eval.episodes": 1,
+    "--eval.video": "none",
+}
+SMALL = [str(part) for flag in _FLAGS.items() for part in flag] + ["--eval.no-references"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A run of this user's, of an environment in the folder where it was trained."""
+    folder = tmp_path_factory.mktemp("mine")
+    (folder / "toy_arm.py").write_text(TOY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        before = list(sys.path)
+        assert main(["train", "toy_arm:make", *SMALL, "--run-dir", "run"]) == 0
+        assert sys.path == [*before, str(folder)]  # it is only appended to
+    yield folder / "run"
+    sys.path.remove(str(folder))
+
+
+@pytest.fixture(autouse=True)
+def _fresh_modules() -> Iterator[None]:
+    before = list(sys.path)
+    yield
+    for name in ("toy_arm", "evil", "colorsys"):
+        sys.modules.pop(name, None)
+    sys.path[:] = before
+
+
+@pytest.fixture
+def stranger(trained: Path, tmp_path: Path) -> Path:
+    """A copy of the run with hostile modules in it, each of which leaves a mark when imported."""
+    folder = tmp_path / "stranger"
+    shutil.copytree(trained, folder)
+    for name in ("evil", "toy_arm"):
+        plant(folder / f"{name}.py")
+    return folder
+
+
+def plant(path: Path) -> None:
+    """A module that does what it should, and writes `imported` beside itself."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mark = f"open({str(path.parent / 'imported')!r}, 'a').write({path.name!r})\n"
+    path.write_text(mark + TOY)
+
+
+def edit(run: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    record = json.loads((run / "config.json").read_text())
+    change(record)
+    (run / "config.json").write_text(json.dumps(record))
+
+
+def set_task(run: Path, task: str) -> None:
+    edit(run, lambda record: record.update(task=task, module_folder=str(run)))
+    edit(run, lambda record: record["config"].update(task=task))
+
+
+COMMANDS = (["evaluate", "--episodes", "1"], ["resume"])
+
+
+@pytest.mark.parametrize(
+    ("attack", "named"),
+    [
+        (lambda run: set_task(run, "evil:make"), "'make' of module 'evil', in folder '{run}'"),
+        (lambda run: set_task(run, "http.server:test"), "'test' of module 'http.server'"),
+        (lambda run: set_task(run, "evil:\x1b[2JFake-v0"), r"'\x1b[2JFake-v0' of module 'evil'"),
+        (lambda run: edit(run, lambda record: record.pop("id")), "no record of training it here"),
+        (lambda run: edit(run, lambda record: record.update(id="../runs")), "no record of"),
+        (lambda run: edit(run, lambda record: record.update(id=["a"])), "no record of"),
+    ],
+)
+def test_code_that_a_run_names_is_not_imported(
+    stranger: Path,
+    attack: Callable[[Path], None],
+    named: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    attack(stranger)
+    monkeypatch.chdir(stranger)
+    for command, *more in COMMANDS:
+        assert main([command, ".", *more]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert named.format(run=stranger) in error
+        assert "add --trust" in error
+    policy = merl.load_policy(stranger)  # runs no code
+    with pytest.raises(MerlError, match="names code as its environment"):
+        policy.make_env()
+    assert not (stranger / "imported").exists()
+
+
+def test_a_run_that_was_trained_here_imports_what_it_was_trained_with(
+    stranger: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the folder that its config names nor the working folder is believed."""
+    edit(stranger, lambda record: record.update(module_folder=str(stranger)))
+    monkeypatch.chdir(stranger)
+    for command, *more in COMMANDS:
+        assert main([command, ".", *more]) == 0
+    merl.load_policy(stranger).make_env().close()
+    assert not (stranger / "imported").exists()
+
+
+def test_a_registered_environment_of_others_is_code(stranger: Path) -> None:
+    gymnasium.register("Evil-v0", entry_point="evil:make")
+    try:
+        set_task(stranger, "Evil-v0")
+        with pytest.raises(MerlError, match="Gymnasium environment 'Evil-v0'"):
+            Run.open(stranger).load_module()
+        assert imports_code("Evil-v0")
+    finally:
+        gymnasium.registry.pop("Evil-v0")
+    for task in ("reach_duplo", "Pendulum-v1", "merl.envs.dot:whole"):
+        assert not imports_code(task)
+    for task in ("merl.cli:main", "os:getcwd", "gymnasium:make"):
+        assert imports_code(task)
+
+
+def test_trust_on_the_line_is_told_and_lasts_once_the_run_is_resumed(
+    stranger: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of another user"))
+    monkeypatch.chdir(tmp_path)
+    edit(stranger, lambda record: record.update(module_folder=str(stranger)))
+    run = str(stranger)
+    assert main(["evaluate", run, "--episodes", "1"]) == 2
+    capsys.readouterr()
+    assert main(["evaluate", run, "--episodes", "1", "--trust"]) == 0
+    importing = f"importing 'make' of module 'toy_arm', in folder {run!r}\n"
+    assert capsys.readouterr().err == f"merl: --trust: {importing}"
+    assert (stranger / "imported").read_text() == "toy_arm.py"
+    merl.load_policy(stranger).make_env(trust=True).close()
+    assert main(["resume", run, "--steps", "40"]) == 2  # that it was evaluated trains nothing
+    assert main(["resume", run, "--steps", "40", "--trust"]) == 0
+    assert main(["evaluate", run, "--episodes", "1"]) == 0
+
+
+def test_the_line_that_began_a_run_names_its_code(
+    stranger: Path, trained: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """`train --resume` imports the module that the user names from where the user is."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of another user"))
+    edit(stranger, lambda record: record.update(module_folder=str(stranger)))
+    monkeypatch.chdir(trained.parent)
+    line = ["train", "toy_arm:make", *SMALL, "--run-dir", str(stranger), "--resume"]
+    assert main(line) == 0
+    assert not (stranger / "imported").exists()
+
+
+def test_a_module_is_loaded_by_its_place_and_replaces_none(tmp_path: Path) -> None:
+    """A file has the name of a module of Python's, which is not loaded, or is."""
+    sys.modules.pop("colorsys", None)
+    for name in ("colorsys", "json"):
+        (tmp_path / f"{name}.py").write_text(TOY)
+    module = load_module("colorsys:make", tmp_path)
+    assert module.__file__ == str(tmp_path / "colorsys.py")
+    assert module_folder("colorsys:make") == tmp_path
+    assert sys.path[-1] == str(tmp_path)
+    with pytest.raises(MerlError, match=r"json\.py cannot be imported: 'json' is the name of ano"):
+        load_module("json:make", tmp_path)
+    assert sys.modules["json"] is json
+
+
+def test_where_no_record_can_be_kept_nothing_is_trusted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    identity, origin = trust.identity(), Origin("evil:make", None)
+    record = {"id": identity, "config": {"task": "evil:make"}, "module_folder": None}
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    trust.remember(record)
+    assert "--trust will be needed" in caplog.text
+    with pytest.raises(MerlError, match="records of runs cannot be read"):
+        trust.check(tmp_path, record)
+    monkeypatch.setenv("XDG_STATE_HOME", "relative")  # would lie in the working folder
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    trust.remember(record)
+    assert (tmp_path / ".local" / "state" / "merl" / "runs" / identity).is_file()
+    assert not (tmp_path / "relative").exists()
+    assert trust.check(tmp_path, record) == origin
+
+
+@pytest.mark.parametrize("name", ["lock", ".config.json.part", "checkpoints/00000020", "replay"])
+def test_no_link_out_of_a_run_is_written_through(
+    stranger: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outside, link = tmp_path / "outside", stranger / name
+    outside.write_text("precious")
+    if link.exists() and not link.is_dir():
+        link.unlink()
+    elif link.exists():
+        shutil.rmtree(link)
+    link.symlink_to(outside)
+    assert main(["resume", str(stranger), "--steps", "40"]) == 2
+    assert f"{link} is a link to {outside}, outside of the run" in capsys.readouterr().err
+    assert outside.read_text() == "precious"
+
+
+def test_the_working_folder_is_not_searched(tmp_path: Path) -> None:
+    """`python -m` would search it first."""
+    for name in ("gymnasium", "numpy", "typing", "logging", "dm_control"):
+        plant(tmp_path / f"{name}.py")
+    command = [sys.executable, "-m", "merl.cli", "--version"]
+    source = str(Path(merl.__file__).parents[1])
+    done = subprocess.run(
+        command,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": source},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.stdout.startswith("merl "), done.stderr
+    assert not (tmp_path / "imported").exists()
+
+
+def test_spaces_are_read_without_code(trained: Path) -> None:
+    observation, _ = Run.open(trained).spaces()
+    assert observation["state"] == spaces.Box(-1, 1, (2,))

@@ -37,8 +37,8 @@ from merl.bench.update import ACTIONS, learner_of, noise_batch, space_of
 from merl.core import Transition
 from merl.core.resources import free_disk
 from merl.envs import make_env
-from merl.networks.augmentation import Crop, draw_shifts
-from merl.replay import Replay, ReplayConfig, pictures, replay_bytes, ring
+from merl.networks.augmentation import RandomShift, draw_shifts
+from merl.replay import EpisodeRing, ReplayConfig, pictures, replay_bytes, ring
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
 from merl.training.timing import use_threads
 
@@ -133,7 +133,9 @@ def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
             if replay_bytes(config, space_of(), ACTION_SPACE) > 0.9 * free_disk(Path(folder)):
                 print(f"{capacity:,} steps are left out: the disk is too small")
                 continue
-            replay = Replay(config, space_of(), ACTION_SPACE, directory=Path(folder) / "replay")
+            replay = EpisodeRing(
+                config, space_of(), ACTION_SPACE, directory=Path(folder) / "replay"
+            )
             _fill(replay, seen, capacity)
             replay.flush()
             name, rng = "compressed" if compress else "raw", np.random.default_rng(0)
@@ -145,10 +147,10 @@ def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
                 yield _row("replay", side, x, [1e3 * seconds / SAMPLES for seconds in each])
 
 
-def _samples(replay: Replay, rng: np.random.Generator) -> None:
+def _samples(replay: EpisodeRing, rng: np.random.Generator) -> None:
     shifts = torch.Generator().manual_seed(0)
     for _ in range(SAMPLES):
-        now, then = (Crop(draw_shifts(256, PAD, shifts), PAD) for _ in range(2))
+        now, then = (RandomShift(draw_shifts(256, PAD, shifts), PAD) for _ in range(2))
         replay.sample(256, rng, {"image": now}, {"image": then})
 
 
@@ -183,7 +185,7 @@ def _arm() -> list[dict[str, Any]]:
     return seen
 
 
-def _fill(ring: Replay, seen: list[dict[str, Any]], steps: int) -> None:
+def _fill(ring: EpisodeRing, seen: list[dict[str, Any]], steps: int) -> None:
     action = np.zeros(ACTIONS, np.float32)
     for step in range(steps):
         if step % EPISODE == 0:

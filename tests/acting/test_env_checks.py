@@ -12,7 +12,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from merl.acting.env_checks import check_instances, refuse_running_statistics
 from merl.core import MerlError
-from merl.envs.adapted import adapt
+from merl.envs.wrappers import adapt
 
 
 class Plain(gymnasium.Env[Any, Any]):

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from helpers import flat, wait_for
 from merl import cli
-from merl.agents.ddpg import DDPG, Draws
+from merl.agents.ddpg import DDPG, UpdateNoise
 from merl.core import Batch
 from merl.report.curves import read_metrics
 from merl.runs.checkpoint import Checkpoint
@@ -136,14 +136,14 @@ def test_what_environments_tell_is_not_mixed(tmp_path: Path) -> None:
     np.testing.assert_allclose(metrics["train/reward/first"], metrics["train/return"], rtol=1e-6)
 
 
-def test_each_worker_meets_other_episodes_and_has_a_lane_of_its_own(
+def test_each_worker_meets_other_episodes_and_has_a_ring_of_its_own(
     three: tuple[Path, str],
 ) -> None:
     seen = [
-        np.fromfile(three[0] / f"replay/{lane}/observation.state.bin", np.float32)
-        for lane in range(3)
+        np.fromfile(three[0] / f"replay/{ring}/observation.state.bin", np.float32)
+        for ring in range(3)
     ]
-    assert all(np.count_nonzero(lane) >= 3 * 50 for lane in seen)
+    assert all(np.count_nonzero(ring) >= 3 * 50 for ring in seen)
     for one, other in ((0, 1), (0, 2), (1, 2)):
         assert not np.intersect1d(seen[one][seen[one] != 0], seen[other][seen[other] != 0]).size
 
@@ -328,7 +328,7 @@ def test_environments_step_while_the_learner_learns(
     """Each step of the environment waits for an update that begins during it."""
     learn = DDPG.learn
 
-    def told(self: DDPG, batch: Batch, draws: Draws) -> dict[str, Tensor]:
+    def told(self: DDPG, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
         (tmp_path / f"learns-{self.step + 1}").touch()
         return learn(self, batch, draws)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from merl.acting.environments import Here, _Worker
+from merl.acting.environments import InProcessEnvs, _Worker
 from merl.acting.generators import (
     global_state,
     kept_generators,
@@ -119,7 +119,7 @@ def test_an_environment_state_of_an_earlier_checkpoint_is_restored() -> None:
 def test_the_seed_of_an_episode_seeds_the_global_generators_of_its_process() -> None:
     env = DotEnv()
     for environment in (
-        lambda seed: Here(env).reset({0: seed}),
+        lambda seed: InProcessEnvs(env).reset({0: seed}),
         lambda seed: _Worker(env, 0).reset(seed=seed),
     ):
         seeded = []

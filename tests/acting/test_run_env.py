@@ -16,7 +16,7 @@ from merl.config import EvaluationConfig, TrainConfig
 from merl.core import EnvironmentFailed, MerlError
 from merl.envs.config import EnvConfig
 from merl.runs.plain import from_plain, to_plain
-from merl.runs.resume import taken_up
+from merl.runs.resume import merge_resume_config
 from merl.training.parts import Parts
 from toy import DotEnv
 
@@ -43,7 +43,7 @@ def test_resume_refuses_other_samples() -> None:
     recorded = TrainConfig("reach_duplo", env=env)
     other = dataclasses.replace(recorded, env=dataclasses.replace(env, samples=2))
     with pytest.raises(MerlError, match=r"cannot go on with env.samples 3 -> 2"):
-        taken_up(recorded, other)
+        merge_resume_config(recorded, other)
 
 
 def test_samples_reach_the_environment_of_a_run() -> None:
@@ -78,7 +78,7 @@ def test_it_gives_what_its_agent_senses(agent: str, keys: set[str]) -> None:
 
 
 def test_what_the_critic_is_told_is_there_too() -> None:
-    agent = dataclasses.replace(AGENTS["merl"], critic_vectors=("state",))
+    agent = dataclasses.replace(AGENTS["merl"], privileged=("state",))
     env = make_run_env(TrainConfig("reach_duplo", agent=agent, env=SMALL))
     assert set(env.reset(seed=0)[0]) == {"image", "proprio", "state"}
     env.close()
@@ -94,12 +94,12 @@ def test_the_dot_is_narrowed_as_well() -> None:
     ("change", "says"),
     [
         (
-            {"vectors": ("proprio",), "critic_vectors": ("proprio",)},
+            {"vectors": ("proprio",), "privileged": ("proprio",)},
             "which the actor has already",
         ),
-        ({"images": (), "critic_vectors": ("proprio",)}, "leaves the actor nothing"),
-        ({"critic_vectors": ("touch",)}, "agent.critic-vectors names 'touch'"),
-        ({"critic_vectors": ("state",), "fusion": "shared"}, "use --agent.fusion decoupled"),
+        ({"images": (), "privileged": ("proprio",)}, "leaves the actor nothing"),
+        ({"privileged": ("touch",)}, "agent.privileged names 'touch'"),
+        ({"privileged": ("state",), "fusion": "shared"}, "use --agent.fusion decoupled"),
         (
             {"images": ("wrist",)},
             r"agent.images names 'wrist', but the environment gives \['image'",

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
-from merl.agents.draws import Draws
+from merl.agents.update_noise import UpdateNoise
 from merl.core import Batch
 
 STACK = 3
@@ -59,7 +59,7 @@ class Case:
             fused=c.latent_dim > 0,
             fusion_norm=c.fusion_norm,
             shared={"decoupled": "", "shared": "critic", "shared_by_both": "both"}[c.fusion],
-            critic_alone=c.critic_vectors,
+            critic_alone=c.privileged,
             squash=c.squash,
             pad=c.shift_pad,
             sigma=c.noise(self.step),
@@ -252,14 +252,14 @@ def sample_of(batch: Batch) -> reference.Sample:
 
 def draws_of(
     chance: reference.Chance, config: AgentConfig, dtype: torch.dtype, step: int = 0
-) -> Draws:
+) -> UpdateNoise:
     """The package takes its noise scaled and clipped."""
 
     def clipped(noise: Tensor) -> Tensor:
         sigma, c = config.noise(step), config.noise_clip
         return (sigma * noise).clamp(-c, c).to(dtype)
 
-    return Draws(
+    return UpdateNoise(
         shifts=chance.shift,
         next_shifts=chance.shift_next,
         next_noise=clipped(chance.noise_next),

@@ -43,8 +43,8 @@ class Spec:
     fusion_norm: bool = True
     shared: str = ""  # "" or whose loss moves the one fusion: "critic", "both"
     critic_alone: tuple[str, ...] = ()  # modalities that the actor does not have
-    squash: str = "tanh"  # or "simplex"
-    simplex_group: int = 8
+    squash: str = "tanh"  # or "simnorm"
+    simnorm_group: int = 8
     pad: int = 4
     sigma: float = 0.2
     clip: float = 0.3
@@ -127,7 +127,7 @@ def tanh(x: Tensor) -> Tensor:
     return 1 - 2 / (torch.exp(2 * x) + 1)
 
 
-def simplex(x: Tensor, group: int) -> Tensor:
+def simnorm(x: Tensor, group: int) -> Tensor:
     """A softmax within every group of neighbours."""
     e = x.unflatten(-1, (-1, group)).exp()  # (B, groups, group)
     return (e / e.sum(-1, keepdim=True)).flatten(-2)
@@ -199,7 +199,7 @@ def h(w: Weights, psi: str, r: Modalities, spec: Spec) -> Tensor:
         x = linear(w, f"{psi}.{key}", r[key])
         if spec.fusion_norm:
             x = layer_norm(w, f"{psi}.{key}.norm", x)
-        return tanh(x) if spec.squash == "tanh" else simplex(x, spec.simplex_group)
+        return tanh(x) if spec.squash == "tanh" else simnorm(x, spec.simnorm_group)
 
     return torch.cat([one(key) for key in keys], -1)
 

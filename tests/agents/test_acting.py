@@ -31,7 +31,7 @@ def with_mean(mean: float, **config: float) -> DDPG:
     return agent
 
 
-@pytest.mark.parametrize("squash", ["tanh", "simplex"])
+@pytest.mark.parametrize("squash", ["tanh", "simnorm"])
 def test_the_mean_is_the_papers(squash: str) -> None:
     """Whole pictures, no noise: what the reference's pi gives at the crop in the middle."""
     case = replace(SEES, config=replace(CONFIG, squash=squash))

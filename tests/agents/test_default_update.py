@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from merl.agents.ddpg import DDPG, DDPGConfig
-from merl.agents.draws import Draws
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SAC, SACConfig
+from merl.agents.update_noise import UpdateNoise
 from merl.core import Batch
 
 SMALL = {"conv_channels": 8, "hidden_dim": 32}
@@ -49,7 +49,7 @@ class WrittenOut:
             for weights in (self.critic_weights, self.actor_weights)
         )
 
-    def learn(self, batch: Batch, draws: Draws) -> None:
+    def learn(self, batch: Batch, draws: UpdateNoise) -> None:
         n, tau = self.networks, self.config.tau
         with self.arithmetic():
             encoded = n.encoders(batch.observation, draws.shifts)

@@ -65,8 +65,8 @@ def test_every_modality_is_used_unless_others_are_named() -> None:
     assert modalities(MERLConfig(), WITH_STATE) == (("image",), ("proprio", "state"))
     assert modalities(MERLConfig(vectors=("state",)), WITH_STATE) == (("image",), ("state",))
     assert modalities(MERLConfig(images=()), WITH_STATE) == ((), ("proprio", "state"))
-    told_to_critic = MERLConfig(critic_vectors=("state",))
-    assert modalities(told_to_critic, WITH_STATE) == (("image",), ("proprio",))
+    privileged_keys = MERLConfig(privileged=("state",))
+    assert modalities(privileged_keys, WITH_STATE) == (("image",), ("proprio",))
 
 
 def test_what_does_not_split_evenly_is_rounded_down() -> None:
@@ -83,15 +83,15 @@ def test_what_does_not_split_evenly_is_rounded_down() -> None:
         ({"vectors": ("joints",)}, "names 'joints'"),
         ({"images": (), "vectors": ()}, "name some with --agent.images or --agent.vectors"),
         ({"vectors": ("proprio", "proprio")}, "names 'proprio' twice"),
-        ({"images": (), "vectors": None, "critic_vectors": ("image",)}, "names 'image'"),
+        ({"images": (), "vectors": None, "privileged": ("image",)}, "names 'image'"),
         ({"latent_dim": 3}, "3 leaves 1 for each of 2 modalities"),
         (
-            {"latent_dim": 3, "critic_vectors": ("state",)},
+            {"latent_dim": 3, "privileged": ("state",)},
             r"each of 2 modalities \(image, proprio\): use at least 4",
         ),
-        ({"latent_dim": 24, "squash": "simplex"}, "multiple of 8 per modality, not 12: use .* 16"),
+        ({"latent_dim": 24, "squash": "simnorm"}, "multiple of 8 per modality, not 12: use .* 16"),
         (
-            {"latent_dim": 120, "squash": "simplex", "critic_vectors": ("state",)},
+            {"latent_dim": 120, "squash": "simnorm", "privileged": ("state",)},
             "not 60: use agent.latent-dim 16",
         ),
         ({"conv_strides": (4, 4, 4, 4)}, "84x84 pixels is too small"),
@@ -99,7 +99,7 @@ def test_what_does_not_split_evenly_is_rounded_down() -> None:
 )
 def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str) -> None:
     with pytest.raises(MerlError, match=says):
-        make(MERLConfig(**config), WITH_STATE if "critic_vectors" in config else SPACE)
+        make(MERLConfig(**config), WITH_STATE if "privileged" in config else SPACE)
 
 
 @pytest.mark.parametrize(

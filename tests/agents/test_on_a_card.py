@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from merl.agents import AGENTS, ddpg
-from merl.agents.draws import Draws
+from merl.agents.update_noise import UpdateNoise
 from merl.bench.update import ACTIONS, learner_of, noise_batch
 from merl.networks import critic, encoders
 
@@ -39,10 +39,10 @@ def _card(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
-def draws(size: int) -> Draws:
+def draws(size: int) -> UpdateNoise:
     shifts = {"image": torch.zeros((size, 2), dtype=torch.int64, device=CARD)}
     noise = torch.zeros((size, ACTIONS), device=CARD)
-    return Draws(shifts, shifts, noise, noise)
+    return UpdateNoise(shifts, shifts, noise, noise)
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,8 @@ from bridge import (
     weights_of,
 )
 
-from merl.agents.draws import Draws
 from merl.agents.sac import SAC, SACConfig
+from merl.agents.update_noise import UpdateNoise
 from merl.core import Batch, MerlError
 
 SMALL = SACConfig(hidden_dim=32, precision="fp32")
@@ -57,8 +57,8 @@ def prepared(case: Case) -> SAC:
     return agent
 
 
-def draws_of(chance: reference_sac.Chance) -> Draws:
-    return Draws(chance.shift, chance.shift_next, chance.noise_next, chance.noise)
+def draws_of(chance: reference_sac.Chance) -> UpdateNoise:
+    return UpdateNoise(chance.shift, chance.shift_next, chance.noise_next, chance.noise)
 
 
 @named_cases(*CASES)

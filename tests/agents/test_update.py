@@ -48,7 +48,7 @@ CASES = [
     Case("strides-2211", replace(SMALL, conv_strides=(2, 2, 1, 1))),
     Case("two-cameras", SMALL, images=TWO_CAMERAS),
     Case("two-vectors", SMALL, vectors={"joints": 5, "touch": 2}),
-    Case("simplex", replace(SMALL, squash="simplex")),
+    Case("simnorm", replace(SMALL, squash="simnorm")),
     Case("without-fusion-norm", replace(SMALL, fusion_norm=False)),
     Case("without-head-norm", replace(SMALL, head_norm=False)),
     Case("without-fusion", replace(SMALL, latent_dim=0)),
@@ -60,7 +60,7 @@ CASES = [
     ),
     Case(
         "informed-critic",
-        replace(SMALL, critic_vectors=("state",)),
+        replace(SMALL, privileged=("state",)),
         vectors={"proprio": 7, "state": 9},
     ),
     Case(
@@ -306,7 +306,7 @@ def test_actions_lie_at_the_clamp_and_beyond(monkeypatch: pytest.MonkeyPatch) ->
         {"clip": 10.0},
         {"sigma": 0.19},
         {"tau": 0.0101},
-        {"squash": "simplex"},
+        {"squash": "simnorm"},
         {"learning_rate": 1.01e-4},
     ],
     ids=lambda change: next(iter(change)),

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 import merl
 from helpers import flat
 from merl.agents import AGENTS, make_agent
-from merl.agents.ddpg import DDPG, Draws
+from merl.agents.ddpg import DDPG, UpdateNoise
 from merl.bench import update as bench
 from merl.bench.plain import Plain
 from merl.core import Batch, MerlError
@@ -111,7 +111,7 @@ def test_the_reference_makes_the_same_update(agent: str, layers: int) -> None:
     batch = Batch(seen(), numbers(BATCH, ACTIONS), numbers(BATCH), numbers(BATCH), seen())
     offsets = [torch.randint(0, 9, (BATCH, 2), generator=generator) for _ in range(2)]
     noises = [0.6 * (numbers(BATCH, ACTIONS) - 0.5) for _ in range(2)]
-    draws = Draws({"image": offsets[0]}, {"image": offsets[1]}, noises[1], noises[0])
+    draws = UpdateNoise({"image": offsets[0]}, {"image": offsets[1]}, noises[1], noises[0])
     joints = agent == "merl"
     if not joints:
         for observation in (batch.observation, batch.next_observation):

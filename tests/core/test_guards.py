@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 
 from merl import cli
 from merl.core import NotFinite
-from merl.core.guards import LossGuard, check_moment, check_weights
+from merl.core.guards import LossGuard, check_finite, check_weights
 from merl.report.curves import read_metrics
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
@@ -110,18 +110,18 @@ def test_a_loss_stops_the_run_and_the_last_checkpoint_is_good(
 
 def test_a_moment() -> None:
     good = {"image": np.zeros((4, 4, 3), np.uint8), "joints": np.zeros(3, np.float32)}
-    check_moment(good, 1.0, 1)
+    check_finite(good, 1.0, 1)
     with pytest.raises(NotFinite, match="reward is inf at step 1,234"):
-        check_moment(good, INF, 1234)
+        check_finite(good, INF, 1234)
     with pytest.raises(NotFinite, match="reward is nan at step 1"):
-        check_moment(good, NAN, 1)
+        check_finite(good, NAN, 1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(NotFinite, match=r"reward is 1e\+39, which is beyond float32, at"):
-            check_moment(good, 1e39, 1)
+            check_finite(good, 1e39, 1)
     joints = np.array([0.0, 1.0, NAN], np.float32)
     with pytest.raises(NotFinite, match="'joints' is nan in place 2 at step 5"):
-        check_moment({**good, "joints": joints}, 1.0, 5)
+        check_finite({**good, "joints": joints}, 1.0, 5)
 
 
 def test_weights() -> None:

@@ -10,7 +10,7 @@ import pytest
 from merl import cli
 from merl.core.python_path import working_folder_hidden
 from merl.core.resources import load_matplotlib
-from merl.envs.own import load_module
+from merl.envs.user_env import load_module
 
 VARIABLE = "PYTHONSAFEPATH"
 

@@ -12,7 +12,7 @@ from test_own import Given, image, vector
 
 from merl.core import EnvironmentFailed, MerlError
 from merl.envs.config import UserEnvConfig
-from merl.envs.own import adapt
+from merl.envs.user_env import adapt
 from merl.envs.user_spaces import advice, brief, modality
 
 LARGEST32, LARGEST64 = float(np.finfo(np.float32).max), float(np.finfo(np.float64).max)

@@ -104,15 +104,15 @@ def test_the_original_is_left_alone() -> None:
 
 @pytest.mark.parametrize("pad", [1, 4])
 def test_shifts_are_uniform(pad: int) -> None:
-    size, places = 90_000, 2 * pad + 1
+    size, ring_index = 90_000, 2 * pad + 1
     shifts = draw_shifts(size, pad, torch.Generator().manual_seed(0))
     assert shifts.dtype == torch.int64
     assert shifts.shape == (size, 2)
-    cells = torch.bincount(shifts[:, 0] * places + shifts[:, 1], minlength=places**2)
-    assert len(cells) == places**2
-    expected = size / places**2
+    cells = torch.bincount(shifts[:, 0] * ring_index + shifts[:, 1], minlength=ring_index**2)
+    assert len(cells) == ring_index**2
+    expected = size / ring_index**2
     chi_squared = float(((cells - expected) ** 2 / expected).sum())
-    freedom = places**2 - 1
+    freedom = ring_index**2 - 1
     assert chi_squared < freedom + 5 * np.sqrt(2 * freedom)
 
 

@@ -45,7 +45,7 @@ def test_each_sense_has_its_share() -> None:
         assert moved.float().mean() < 0.34
 
 
-def test_simplex_groups_sum_to_one() -> None:
-    latent = Fusion(FEATURES, 16, squash="simplex")(encoded(FEATURES))
+def test_simnorm_groups_sum_to_one() -> None:
+    latent = Fusion(FEATURES, 16, squash="simnorm")(encoded(FEATURES))
     assert latent.min() > 0
     torch.testing.assert_close(latent.unflatten(-1, (4, 8)).sum(-1), torch.ones(64, 4))

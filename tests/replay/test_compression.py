@@ -12,10 +12,10 @@ from gymnasium import spaces
 
 import merl
 from merl.core import Batch, MerlError, Transition
-from merl.replay import Replay, ReplayConfig, replay_bytes
+from merl.replay import EpisodeRing, ReplayConfig, replay_bytes
 from merl.replay.backgrounds import STAGES, Backgrounds
 from merl.replay.compression import CompressedPictures
-from merl.replay.places import Places
+from merl.replay.ring_index import RingIndex
 
 SIDE = 16
 NOISE = spaces.Dict({"image": spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)})
@@ -35,15 +35,17 @@ def noise(number: int) -> dict[str, np.ndarray]:
 Observe = Callable[[int], dict[str, np.ndarray]]
 
 
-def play(replay: Replay, begin: int, steps: int, length: int = 7, observe: Observe = noise) -> None:
-    """Moments `begin`, ...: the picture has the moment's number, the action its step's."""
-    for moment in range(begin, begin + steps):
-        if moment % length == 0:
-            replay.begin(observe(moment))
+def play(
+    replay: EpisodeRing, begin: int, steps: int, length: int = 7, observe: Observe = noise
+) -> None:
+    """Timesteps `begin`, ...: the picture has the timestep's number, the action its step's."""
+    for timestep in range(begin, begin + steps):
+        if timestep % length == 0:
+            replay.begin(observe(timestep))
         else:
-            action = np.array([moment / 1000], np.float32)
-            last = moment % length == length - 1
-            replay.add(Transition(action, float(moment), 1.0, observe(moment), last))
+            action = np.array([timestep / 1000], np.float32)
+            last = timestep % length == length - 1
+            replay.add(Transition(action, float(timestep), 1.0, observe(timestep), last))
 
 
 class Every:
@@ -51,18 +53,18 @@ class Every:
         return np.arange(low, high)
 
 
-def everything(replay: Replay) -> Batch:
+def everything(replay: EpisodeRing) -> Batch:
     return replay.sample(len(replay), Every())  # type: ignore[arg-type]
 
 
 def assert_right(batch: Batch, newest: int) -> None:
-    """Step k led to moment k; all up to the newest are there, and their pictures are theirs."""
-    moments = (batch.action[:, 0] * 1000).round().int().tolist()
-    assert moments[-1] == newest
-    assert moments == [m for m in range(moments[0], newest + 1) if m % 7]
-    for row, moment in enumerate(moments):
-        begun = moment - moment % 7
-        stack = [max(begun, moment - 1 - back) for back in (2, 1, 0)]
+    """Step k led to timestep k; all up to the newest are there, and their pictures are theirs."""
+    timesteps = (batch.action[:, 0] * 1000).round().int().tolist()
+    assert timesteps[-1] == newest
+    assert timesteps == [m for m in range(timesteps[0], newest + 1) if m % 7]
+    for row, timestep in enumerate(timesteps):
+        begun = timestep - timestep % 7
+        stack = [max(begun, timestep - 1 - back) for back in (2, 1, 0)]
         expected = np.stack([noise(m)["image"] for m in stack])
         np.testing.assert_array_equal(batch.observation["image"][row], expected)
 
@@ -82,7 +84,7 @@ def test_it_gives_what_the_raw_one_gives(tmp_path: Path, renderer: str) -> None:
     env = merl.make_env("move_box", renderer=renderer)
     space, actions = env.observation_space, env.action_space
     raw, packed = (
-        Replay(config(capacity=200, compress=c), space, actions, directory=tmp_path / str(c))
+        EpisodeRing(config(capacity=200, compress=c), space, actions, directory=tmp_path / str(c))
         for c in (False, True)
     )
     for episode in range(6):  # so that backgrounds change twice
@@ -96,7 +98,7 @@ def test_it_gives_what_the_raw_one_gives(tmp_path: Path, renderer: str) -> None:
                 replay.add(Transition(action, float(reward), 1.0, observation, step == 19))
     env.close()
     assert_same(everything(raw), everything(packed))
-    packed = Replay(config(capacity=200), space, actions, directory=tmp_path / "True")
+    packed = EpisodeRing(config(capacity=200), space, actions, directory=tmp_path / "True")
     assert_same(everything(raw), everything(packed))
     spans = np.fromfile(tmp_path / "True" / "observation.image.span.bin", "<i8").reshape(-1, 2)
     kept = spans[spans[:, 1] > 0, 1]
@@ -115,10 +117,10 @@ def test_a_million_steps_take_at_most_six_gigabytes() -> None:
 def test_pictures_that_take_more_than_is_reserved_cost_steps_and_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
-    for moment in range(0, 245, 7):
-        play(replay, moment, 7)
-        assert_right(everything(replay), moment + 6)
+    replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
+    for timestep in range(0, 245, 7):
+        play(replay, timestep, 7)
+        assert_right(everything(replay), timestep + 6)
     assert 10 < len(replay) < 30
     told = "pictures take more bytes than --replay.compress reserves"
     assert caplog.text.count(told) == 1
@@ -129,36 +131,36 @@ def test_pictures_that_take_more_than_is_reserved_cost_steps_and_are_told(
 @pytest.mark.parametrize("frame_stack", [1, 3, 6])
 def test_even_the_smallest_has_a_step_to_learn_from(capacity: int, frame_stack: int) -> None:
     settings = config(capacity=capacity, batch_size=1, frame_stack=frame_stack)
-    replay = Replay(settings, NOISE, ACTIONS)
-    for moment in range(200):
-        play(replay, moment, 1)
-        if moment:
+    replay = EpisodeRing(settings, NOISE, ACTIONS)
+    for timestep in range(200):
+        play(replay, timestep, 1)
+        if timestep:
             assert 1 <= len(replay) <= capacity
             batch = everything(replay)
-            newest = moment if moment % 7 else moment - 1
+            newest = timestep if timestep % 7 else timestep - 1
             assert round(float(batch.action[-1, 0]) * 1000) == newest
             picture = noise(newest - 1)["image"]
             np.testing.assert_array_equal(batch.observation["image"][-1, -1], picture)
 
 
 def test_it_is_opened_again_as_it_was(tmp_path: Path) -> None:
-    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     for begin in range(0, 140, 10):
         play(replay, begin, 10)
         before = everything(replay)
-        again = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+        again = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
         assert_same(everything(again), before)
 
 
 def test_it_goes_back_to_its_last_checkpoint_exactly(tmp_path: Path) -> None:
-    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     play(replay, 0, 140)
     for begin in range(140, 280, 35):
         replay.flush()
         state, before = replay.state_dict(), everything(replay)
         replay.settle()
         play(replay, begin, 40)  # most of what was held is overwritten, and the process dies
-        replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+        replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
         replay.load_state_dict(state)
         assert_same(everything(replay), before)
         play(replay, begin, 35)
@@ -166,7 +168,7 @@ def test_it_goes_back_to_its_last_checkpoint_exactly(tmp_path: Path) -> None:
 
 
 def test_a_picture_half_written_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     play(replay, 0, 144)
     whole = CompressedPictures.write
 
@@ -179,22 +181,22 @@ def test_a_picture_half_written_is_none(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(KeyboardInterrupt):
         play(replay, 144, 1)
     monkeypatch.undo()
-    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     assert_right(everything(replay), 143)
 
 
 @pytest.mark.parametrize("capacity", [62, 90, 300])
 @pytest.mark.parametrize("played", [35, 49, 63, 77, 140])
 def test_it_grows_where_its_bytes_have_wrapped(tmp_path: Path, capacity: int, played: int) -> None:
-    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     play(replay, 0, played)
     before = everything(replay)
-    again = Replay(config(capacity=capacity), NOISE, ACTIONS, directory=tmp_path)
+    again = EpisodeRing(config(capacity=capacity), NOISE, ACTIONS, directory=tmp_path)
     assert_same(everything(again), before)
     for begin in range(played, played + 280, 35):
         play(again, begin, 35)
         assert_right(everything(again), begin + 34)
-        again = Replay(config(capacity=capacity), NOISE, ACTIONS, directory=tmp_path)
+        again = EpisodeRing(config(capacity=capacity), NOISE, ACTIONS, directory=tmp_path)
         assert_right(everything(again), begin + 34)
     assert len(again) > len(before.action) * min(capacity / 70, 1.2)
 
@@ -205,7 +207,7 @@ def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> 
     file = tmp_path / "starts"
     pictures = CompressedPictures(
         np.zeros(100_000, np.uint8),
-        Places(100_000),
+        RingIndex(100_000),
         np.zeros((100, 2), np.int64),
         (8, 8, 3),
         file,
@@ -225,11 +227,11 @@ def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> 
     assert file.stat().st_size == STAGES[-1] * still.nbytes
 
 
-def still_life(moment: int) -> dict[str, np.ndarray]:
+def still_life(timestep: int) -> dict[str, np.ndarray]:
     """A noisy wall, and something small before it that is elsewhere each time."""
     picture = noise(0)["image"]
-    row, column = np.random.default_rng(moment).integers(0, SIDE - 3, 2)
-    picture[row : row + 3, column : column + 3] = moment % 256
+    row, column = np.random.default_rng(timestep).integers(0, SIDE - 3, 2)
+    picture[row : row + 3, column : column + 3] = timestep % 256
     return {"image": picture}
 
 
@@ -238,15 +240,15 @@ def test_one_gone_back_to_its_checkpoint_keeps_the_same_steps_as_one_that_was_ne
     tmp_path: Path, killed: int
 ) -> None:
     small = config(capacity=40)
-    whole = Replay(small, NOISE, ACTIONS, directory=tmp_path / "whole")
-    replay = Replay(small, NOISE, ACTIONS, directory=tmp_path / "killed")
+    whole = EpisodeRing(small, NOISE, ACTIONS, directory=tmp_path / "whole")
+    replay = EpisodeRing(small, NOISE, ACTIONS, directory=tmp_path / "killed")
     play(whole, 0, 7 * killed, observe=still_life)
     play(replay, 0, 7 * killed, observe=still_life)
     replay.flush()
     state = replay.state_dict()
     replay.settle()
     play(replay, 7 * killed, 7 * 9, observe=still_life)
-    replay = Replay(small, NOISE, ACTIONS, directory=tmp_path / "killed")
+    replay = EpisodeRing(small, NOISE, ACTIONS, directory=tmp_path / "killed")
     replay.load_state_dict(state)
     for episode in range(killed, 40):
         play(whole, 7 * episode, 7, observe=still_life)
@@ -275,17 +277,17 @@ def test_backgrounds_are_made_of_what_the_disk_took(
 
 
 def test_pictures_whose_background_is_gone_are_refused(tmp_path: Path) -> None:
-    replay = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     play(replay, 0, 49)
     state = replay.state_dict()
     starts = tmp_path / "observation.image.starts"
     whole = starts.read_bytes()
     starts.write_bytes(whole[:-1])
-    again = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    again = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     with pytest.raises(MerlError, match=r"image\.starts holds 6 of the 7 pictures"):
         again.load_state_dict(state)
     starts.write_bytes(whole)
-    again = Replay(config(), NOISE, ACTIONS, directory=tmp_path)
+    again = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     again.load_state_dict(state)
     assert_same(everything(again), everything(replay))
 

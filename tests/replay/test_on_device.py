@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from test_replay import Account, Episode, Every, make, write
 
 from merl.core import Batch
-from merl.replay import Replay
+from merl.replay import EpisodeRing
 from merl.replay.on_device import CHUNK, OnDevice, bytes_on_device
 
 EPISODES = st.builds(Episode, st.integers(1, 9), st.sampled_from(["end", "limit", "cut"]))
 
 
-def writing(replay: Replay, number: int, episodes: list[Episode]) -> Iterator[None]:
-    """A moment at a time."""
+def writing(replay: EpisodeRing, number: int, episodes: list[Episode]) -> Iterator[None]:
+    """A timestep at a time."""
     account = Account(replay.config)
     for index, plan in enumerate(episodes):
         for t in range(plan.length + 1):
@@ -35,7 +35,7 @@ def tensors(batch: Batch) -> dict[str, torch.Tensor]:
     return observations | rest
 
 
-def check(copy: OnDevice, rings: list[Replay]) -> None:
+def check(copy: OnDevice, rings: list[EpisodeRing]) -> None:
     """Every step of every ring, as the ring itself gives it."""
     for number, ring in enumerate(rings):
         if not len(ring):
@@ -58,13 +58,13 @@ def test_it_gives_what_the_rings_give(plans: list[list[Episode]], data: st.DataO
         for number, (ring, plan) in enumerate(zip(rings, plans, strict=True))
     ]
     every = data.draw(st.integers(1, 40))
-    moment = 0
+    timestep = 0
     while todo:
         for one in list(todo):
             if next(one, "over") == "over":
                 todo.remove(one)
-        moment += 1
-        if moment % every == 0:
+        timestep += 1
+        if timestep % every == 0:
             copy.follow()
             check(copy, rings)
     copy.follow()
@@ -133,7 +133,7 @@ def test_rings_that_have_grown_by_different_amounts(tmp_path: Path) -> None:
         for _ in writing(ring, number, plan):
             pass
         rings.append(make(tmp_path / str(number), capacity=30))
-    lengths = [ring.places.length for ring in rings]
+    lengths = [ring.ring_index.length for ring in rings]
     assert len(set(lengths)) == 2
     copy = OnDevice(rings, torch.device("cpu"))
     for episode in range(6):

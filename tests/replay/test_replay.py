@@ -24,7 +24,15 @@ from hypothesis import strategies as st
 
 from helpers import wait_for
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.replay import Lanes, Replay, ReplayConfig, check_fits, pictures, replay_bytes, storage
+from merl.replay import (
+    EpisodeRing,
+    ReplayBuffer,
+    ReplayConfig,
+    check_fits,
+    pictures,
+    replay_bytes,
+    storage,
+)
 from merl.replay.pictures import ReadAhead
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
@@ -39,12 +47,12 @@ def config(**values: Any) -> ReplayConfig:
     return ReplayConfig(**{"capacity": 20, "batch_size": 1, "discount": 0.9} | values)
 
 
-def make(directory: Path | None = None, **values: Any) -> Replay:
-    return Replay(config(**values), OBSERVATIONS, ACTIONS, directory=directory)
+def make(directory: Path | None = None, **values: Any) -> EpisodeRing:
+    return EpisodeRing(config(**values), OBSERVATIONS, ACTIONS, directory=directory)
 
 
 def observe(episode: int, t: int) -> dict[str, np.ndarray]:
-    """What is seen at moment t of an episode; no two moments and no two pixels are alike."""
+    """What is seen at timestep t of an episode; no two timesteps and no two pixels are alike."""
     seen: dict[str, np.ndarray] = {}
     for salt, (key, shape) in enumerate(IMAGES.items()):
         pixels = np.arange(np.prod(shape), dtype=np.int64).reshape(shape)
@@ -80,9 +88,9 @@ class Account:
     """What a replay must do, told as plainly as can be: lists, loops, one row at a time."""
 
     config: ReplayConfig
-    moments: list[tuple[int, int]] = field(default_factory=list)  # (episode, t), all ever written
+    timesteps: list[tuple[int, int]] = field(default_factory=list)  # (episode, t), all ever written
     ended: set[int] = field(default_factory=set)  # episodes that truly ended
-    lost: int = 0  # so many of the oldest moments are overwritten
+    lost: int = 0  # so many of the oldest timesteps are overwritten
     length: int = 0  # slots, if they are more than the capacity asks for
 
     @property
@@ -96,13 +104,13 @@ class Account:
         )
 
     def see(self, episode: int, t: int) -> None:
-        self.moments.append((episode, t))
-        self.lost = max(self.lost, len(self.moments) - self.slots)
+        self.timesteps.append((episode, t))
+        self.lost = max(self.lost, len(self.timesteps) - self.slots)
 
     def held(self) -> list[tuple[int, int]]:
         """The steps that must be sampled: the newest, with all of their stack."""
-        alive = set(self.moments[self.lost :])
-        steps = [a for a, b in pairwise(self.moments) if b == (a[0], a[1] + 1)]
+        alive = set(self.timesteps[self.lost :])
+        steps = [a for a, b in pairwise(self.timesteps) if b == (a[0], a[1] + 1)]
         whole = [(e, t) for e, t in steps if all(frame in alive for frame in self.stack(e, t))]
         return whole[-self.config.capacity :]
 
@@ -110,8 +118,8 @@ class Account:
         return [(episode, max(0, t - back)) for back in reversed(range(self.config.frame_stack))]
 
     def row(self, episode: int, t: int) -> tuple[float, float, int]:
-        """Return, discount and the moment that the return bootstraps from."""
-        last = max(s for e, s in self.moments if e == episode)
+        """Return, discount and the timestep that the return bootstraps from."""
+        last = max(s for e, s in self.timesteps if e == episode)
         total, weight = 0.0, 1.0
         for _ in range(self.config.n_step):
             total += weight * pay(episode, t)
@@ -122,8 +130,8 @@ class Account:
         return total, weight, t
 
 
-def write(replay: Replay, account: Account, episode: int, t: int, plan: Episode) -> None:
-    """Moment t of an episode, into both."""
+def write(replay: EpisodeRing, account: Account, episode: int, t: int, plan: Episode) -> None:
+    """Timestep t of an episode, into both."""
     if t == 0:
         replay.begin(observe(episode, 0))
     else:
@@ -138,7 +146,7 @@ def write(replay: Replay, account: Account, episode: int, t: int, plan: Episode)
     account.see(episode, t)
 
 
-def check(replay: Replay, account: Account) -> None:
+def check(replay: EpisodeRing, account: Account) -> None:
     """All that the replay can sample is what the account says, each step once."""
     held = account.held()
     assert len(replay) == len(held)
@@ -148,18 +156,18 @@ def check(replay: Replay, account: Account) -> None:
 
 def check_rows(batch: Batch, account: Account, steps: list[tuple[int, int]]) -> None:
     def stacked(key: str, episode: int, t: int) -> np.ndarray:
-        return np.stack([observe(*moment)[key] for moment in account.stack(episode, t)])
+        return np.stack([observe(*timestep)[key] for timestep in account.stack(episode, t)])
 
     assert [tuple(row) for row in batch.action.tolist()] == steps
     rows = [account.row(*step) for step in steps]
     np.testing.assert_allclose(batch.reward, [row[0] for row in rows], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(batch.discount, [row[1] for row in rows], rtol=1e-6)
     ends = [(episode, end) for (episode, _), (_, _, end) in zip(steps, rows, strict=True)]
-    for observation, moments in ((batch.observation, steps), (batch.next_observation, ends)):
+    for observation, timesteps in ((batch.observation, steps), (batch.next_observation, ends)):
         assert observation.keys() == set(OBSERVATIONS.spaces)
         for key in IMAGES:
-            np.testing.assert_array_equal(observation[key], [stacked(key, *m) for m in moments])
-        joints = [observe(*moment)["joints"] for moment in moments]
+            np.testing.assert_array_equal(observation[key], [stacked(key, *m) for m in timesteps])
+        joints = [observe(*timestep)["joints"] for timestep in timesteps]
         np.testing.assert_array_equal(observation["joints"], joints)
 
 
@@ -179,7 +187,7 @@ plans = st.lists(
 
 
 def brute_force(settings: ReplayConfig, episodes: list[Episode]) -> None:
-    replay = Replay(settings, OBSERVATIONS, ACTIONS)
+    replay = EpisodeRing(settings, OBSERVATIONS, ACTIONS)
     account = Account(settings)
     for episode, plan in enumerate(episodes):
         for t in range(plan.length + 1):
@@ -274,14 +282,14 @@ def test_what_is_read_ahead_holds_the_batch_and_no_more(tmp_path, monkeypatch, c
     for episode in range(9):  # it wraps
         for t in range(8):
             write(replay, account, episode, t, Episode(7, "limit"))
-    asked, picks, pick = [], [], replay._sampler.pick
+    asked, indices, pick = [], [], replay._sampler.pick
     monkeypatch.setattr(replay._ahead, "ask", lambda _, *stretch: asked.append(stretch))
     replay.sample(1, Every())
     assert not asked  # all of it is in memory
     monkeypatch.setattr(ReadAhead, "is_wanted", True)
-    replay._sampler.pick = lambda *a, **k: (picks.append(pick(*a, **k)), picks[0])[1]
+    replay._sampler.pick = lambda *a, **k: (indices.append(pick(*a, **k)), indices[0])[1]
     replay.sample(1, Every())
-    now, then = picks[0].now, picks[0].then
+    now, then = indices[0].now, indices[0].then
     parts = [torch.cat([now, then], dim=1)] if n_step == 3 else [now, then]
     wanted = [(part.numpy(), *image) for part in parts for image in IMAGES.items()]
     for (slots, key, shape), (begin, end) in zip(wanted, asked, strict=True):
@@ -345,20 +353,20 @@ def in_memory(mapped: mmap.mmap) -> set[int]:
 @pytest.mark.parametrize("count", [1, 3])
 def test_frames_are_copied_as_it_is_told(compress, count):
     """What is made of a stack meets the stack, its place and its number in the batch."""
-    lanes = Lanes(config(capacity=90, compress=compress), OBSERVATIONS, ACTIONS, count=count)
-    for number, lane in enumerate(lanes.lanes):
-        account = Account(lane.config)
+    rings = ReplayBuffer(config(capacity=90, compress=compress), OBSERVATIONS, ACTIONS, count=count)
+    for number, ring in enumerate(rings.rings):
+        account = Account(ring.config)
         for episode in range(4):
             for t in range(9):
-                write(lane, account, 10 * number + episode, t, Episode(8, "limit"))
-    plain = lanes.sample(50, np.random.default_rng(3))
+                write(ring, account, 10 * number + episode, t, Episode(8, "limit"))
+    plain = rings.sample(50, np.random.default_rng(3))
     told = []
 
     def mirrored(sample, frames, out):
         told.append(sample)
         out[:] = 255 - frames
 
-    batch = lanes.sample(
+    batch = rings.sample(
         50, np.random.default_rng(3), {"front": mirrored}, {"wrist/left": mirrored}
     )
     assert sorted(told) == sorted([*range(50), *range(50)])
@@ -389,7 +397,7 @@ def test_every_step_is_drawn_equally_often():
 
 def test_it_keeps_all_of_its_capacity_and_no_more():
     settings = config(capacity=1000)
-    replay, account = Replay(settings, OBSERVATIONS, ACTIONS), Account(settings)
+    replay, account = EpisodeRing(settings, OBSERVATIONS, ACTIONS), Account(settings)
     for episode in range(6):
         for t in range(251):
             write(replay, account, episode, t, Episode(250, "limit"))
@@ -415,8 +423,8 @@ class Run:
             for t in range(length + 1):
                 write(self.replay, self.account, self.episode, t, Episode(length, ending))
 
-    def go_back(self, state: dict[str, Any], moments: int) -> None:
-        del self.account.moments[moments:]
+    def go_back(self, state: dict[str, Any], timesteps: int) -> None:
+        del self.account.timesteps[timesteps:]
         self.replay = make(self.directory, **self.values)
         self.replay.load_state_dict(state)
 
@@ -446,10 +454,13 @@ def test_going_on_from_a_state_is_as_if_nothing_had_happened(tmp_path):
     for run in (plain, broken):
         run.play(5, 4, 6, 8)
     # A few steps more, and the process dies.
-    state, moments = json.loads(json.dumps(broken.replay.state_dict())), len(broken.account.moments)
+    state, timesteps = (
+        json.loads(json.dumps(broken.replay.state_dict())),
+        len(broken.account.timesteps),
+    )
     episode = broken.episode
     broken.play(1)
-    broken.go_back(state, moments)
+    broken.go_back(state, timesteps)
     broken.episode = episode
     assert broken.replay.state_dict() == plain.replay.state_dict()
     for run in (plain, broken):
@@ -466,24 +477,24 @@ def test_an_episode_in_progress_goes_on_from_its_state(tmp_path):
     run.play(5)
     run.play(3, ending="cut")
     run.replay.flush()
-    run.go_back(run.replay.state_dict(), len(run.account.moments))
+    run.go_back(run.replay.state_dict(), len(run.account.timesteps))
     write(run.replay, run.account, 1, 4, Episode(4, "end"))
     check(run.replay, run.account)
 
 
 def go_back_anywhere(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
     """Save somewhere, write on, go back, write on again: whatever is held then is right."""
-    replay, account = Replay(settings, OBSERVATIONS, ACTIONS), Account(settings)
+    replay, account = EpisodeRing(settings, OBSERVATIONS, ACTIONS), Account(settings)
     state, saved = replay.state_dict(), 0
     for episode, plan in enumerate(episodes):
         for t in range(plan.length + 1):
             write(replay, account, episode, t, plan)
         move = data.draw(st.sampled_from(["go on", "save", "go back"]))
         if move == "save":
-            state, saved = replay.state_dict(), len(account.moments)
+            state, saved = replay.state_dict(), len(account.timesteps)
         elif move == "go back" and saved > account.lost:
             replay.load_state_dict(state)
-            del account.moments[saved:]
+            del account.timesteps[saved:]
         check(replay, account)
 
 
@@ -501,9 +512,9 @@ def test_going_back_anywhere_long(config, episodes, data):
 
 
 def go_back_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
-    """Save, write on, die at any moment, go back: all that was held at the save is held again."""
+    """Save, write on, die at any time, go back: all that was held at the save is held again."""
     with tempfile.TemporaryDirectory() as folder:
-        replay = Replay(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
+        replay = EpisodeRing(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
         account = Account(settings)
         state, saved, lost = replay.state_dict(), 0, 0
         for episode, plan in enumerate(episodes):
@@ -512,13 +523,13 @@ def go_back_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.Da
             move = data.draw(st.sampled_from(["go on", "save", "save and die", "die"]))
             if move.startswith("save"):
                 replay.flush()
-                state, saved, lost = replay.state_dict(), len(account.moments), account.lost
+                state, saved, lost = replay.state_dict(), len(account.timesteps), account.lost
             if move == "save":
                 replay.settle()
             elif move.endswith("die"):
-                replay = Replay(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
+                replay = EpisodeRing(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
                 replay.load_state_dict(state)
-                del account.moments[saved:]
+                del account.timesteps[saved:]
                 account.lost = lost
             check(replay, account)
 
@@ -550,12 +561,12 @@ def test_a_full_disk_costs_the_journal_and_no_more(tmp_path, caplog):
     run = Run(tmp_path / "replay")
     run.play(9, 9)
     run.replay.flush()
-    state, moments = run.replay.state_dict(), len(run.account.moments)
+    state, timesteps = run.replay.state_dict(), len(run.account.timesteps)
     run.replay.settle()
     run.replay._journal._file = Full(run.replay._journal._file)
     run.play(9, 2)
     assert caplog.text.count("the disk is full") == 1
-    run.go_back(state, moments)  # to what the ring itself still holds
+    run.go_back(state, timesteps)  # to what the ring itself still holds
     check(run.replay, run.account)
     assert 0 < len(run.replay) < 18
 
@@ -563,21 +574,21 @@ def test_a_full_disk_costs_the_journal_and_no_more(tmp_path, caplog):
 def test_what_came_after_a_state_does_not_come_back(tmp_path):
     run = Run(tmp_path / "replay")
     run.play(4)
-    state, moments = run.replay.state_dict(), len(run.account.moments)
+    state, timesteps = run.replay.state_dict(), len(run.account.timesteps)
     run.play(9)
-    run.go_back(state, moments)
+    run.go_back(state, timesteps)
     run.play(2, ending="cut")  # ends within what was written before
     run.replay = make(run.directory)
     check(run.replay, run.account)
 
 
-def test_a_moment_half_written_is_none(tmp_path):
+def test_a_timestep_half_written_is_none(tmp_path):
     class Dies:
         def __setitem__(self, slot: int, value: float) -> None:
             raise KeyboardInterrupt
 
     run = Run(tmp_path / "replay")
-    run.play(30, ending="cut")  # so that an older moment lies where the next will
+    run.play(30, ending="cut")  # so that an older timestep lies where the next will
     run.replay._data["reward"] = Dies()
     with pytest.raises(KeyboardInterrupt):
         run.replay.add(Transition(act(0, 30), 0.0, 1.0, observe(0, 31), last=False))
@@ -590,7 +601,7 @@ def test_a_state_that_is_not_held_is_refused(tmp_path):
     run = Run(tmp_path / "replay")
     run.play(5)
     state = run.replay.state_dict()
-    with pytest.raises(MerlError, match="does not hold moment 6"):
+    with pytest.raises(MerlError, match="does not hold timestep 6"):
         make().load_state_dict(state)
     check(run.replay, run.account)  # and nothing has changed
 
@@ -625,11 +636,11 @@ def test_it_grows_when_opened_with_a_larger_capacity(tmp_path):
 
 def lengthen(run: Run, capacity: int) -> None:
     """Open it again, with a larger capacity."""
-    before, held = run.replay.places.length, run.account.held()
+    before, held = run.replay.ring_index.length, run.account.held()
     run.values["capacity"] = capacity
     run.account.config = config(**run.values)
     run.replay = make(run.directory, **run.values)
-    run.account.length, nominal = run.replay.places.length, Account(run.account.config).slots
+    run.account.length, nominal = run.replay.ring_index.length, Account(run.account.config).slots
     assert nominal <= run.account.length <= max(nominal, 1.5 * before)
     assert run.account.held()[-len(held) :] == held
 
@@ -659,13 +670,17 @@ def test_it_grows_and_goes_back_to_its_last_checkpoint(tmp_path, compress):
         run = Run(tmp_path / str(more), compress=compress)
         run.play(9, 9, 9, 5)
         run.replay.flush()
-        state, moments, lost = run.replay.state_dict(), len(run.account.moments), run.account.lost
+        state, timesteps, lost = (
+            run.replay.state_dict(),
+            len(run.account.timesteps),
+            run.account.lost,
+        )
         run.replay.settle()
         run.play(*[2] * more)  # what was held is overwritten, and the process dies
         run.values["capacity"] = 50
         run.account.config = config(**run.values)
-        run.go_back(state, moments)
-        run.account.length, run.account.lost = run.replay.places.length, lost
+        run.go_back(state, timesteps)
+        run.account.length, run.account.lost = run.replay.ring_index.length, lost
         check(run.replay, run.account)
         run.play(*[9] * 8)
         check(run.replay, run.account)
@@ -726,7 +741,7 @@ def test_a_step_takes_at_most_21_6_kilobytes(tmp_path):
     )
     actions = gymnasium.spaces.Box(-1, 1, (9,), np.float32)
     settings = ReplayConfig(capacity=1000)
-    replay = Replay(settings, observations, actions, directory=tmp_path)
+    replay = EpisodeRing(settings, observations, actions, directory=tmp_path)
     seen = observations.sample()
     for t in range(1000):
         if t % 250 == 0:
@@ -808,7 +823,7 @@ def test_growing_on_a_full_disk_changes_nothing(tmp_path, monkeypatch):
 
     def full(file: int, start: int, size: int) -> None:
         reserve(file, start, size)
-        if start == 23 * 8:  # the last field, moment
+        if start == 23 * 8:  # the last field, timestep
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
@@ -837,7 +852,7 @@ def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, whe
     monkeypatch.setattr(f"merl.replay.config.{where}", lambda *_: room)
     directory = tmp_path / "run" / "replay"
     with pytest.raises(MerlError, match=what) as caught:
-        Replay(settings, OBSERVATIONS, ACTIONS, directory=directory)
+        EpisodeRing(settings, OBSERVATIONS, ACTIONS, directory=directory)
     assert "1,000,000 steps" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
@@ -851,22 +866,22 @@ def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, whe
 @pytest.mark.parametrize("count", [1, 3, 7])
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("capacity", [20, 100])
-def test_several_lanes_take_what_was_announced(tmp_path, count, compress, capacity):
+def test_several_rings_take_what_was_announced(tmp_path, count, compress, capacity):
     settings = config(capacity=capacity, batch_size=20, compress=compress)
-    Lanes(settings, OBSERVATIONS, ACTIONS, count=count, directory=tmp_path)
+    ReplayBuffer(settings, OBSERVATIONS, ACTIONS, count=count, directory=tmp_path)
     taken = sum(file.stat().st_size for file in tmp_path.rglob("*.bin"))
-    assert taken == replay_bytes(settings, OBSERVATIONS, ACTIONS, lanes=count)
+    assert taken == replay_bytes(settings, OBSERVATIONS, ACTIONS, rings=count)
 
 
-def test_lanes_that_do_not_fit_together_are_refused(tmp_path, monkeypatch):
+def test_rings_that_do_not_fit_together_are_refused(tmp_path, monkeypatch):
     settings = config(capacity=100)
-    both = replay_bytes(settings, OBSERVATIONS, ACTIONS, lanes=2)
+    both = replay_bytes(settings, OBSERVATIONS, ACTIONS, rings=2)
     monkeypatch.setattr("merl.replay.config.available_memory", lambda: both - 1)
     with pytest.raises(MerlError, match=r"100 steps .* --replay\.capacity"):
-        Lanes(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
+        ReplayBuffer(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr("merl.replay.config.available_memory", lambda: both)
-    Lanes(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
+    ReplayBuffer(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
 
 
 def test_where_compression_would_fit_that_is_said(monkeypatch):
@@ -938,7 +953,7 @@ def test_a_batch_larger_than_the_replay_is_refused():
 )
 def test_a_space_that_is_neither_image_nor_vector_is_refused(space):
     with pytest.raises(MerlError, match="observation 'depth'"):
-        Replay(config(), gymnasium.spaces.Dict({"depth": space}), ACTIONS)
+        EpisodeRing(config(), gymnasium.spaces.Dict({"depth": space}), ACTIONS)
 
 
 @pytest.mark.parametrize(
@@ -1008,7 +1023,7 @@ def test_a_directory_with_another_replay_is_refused(tmp_path):
     make(tmp_path)
     other = gymnasium.spaces.Dict({"joints": OBSERVATIONS["joints"]})
     with pytest.raises(MerlError, match="other observations"):
-        Replay(config(), other, ACTIONS, directory=tmp_path)
+        EpisodeRing(config(), other, ACTIONS, directory=tmp_path)
 
 
 def test_a_damaged_directory_is_refused(tmp_path):

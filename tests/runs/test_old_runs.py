@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import compose
-from merl.runs.resume import taken_up
+from merl.runs.resume import merge_resume_config
 from merl.runs.run import Run
 
 IMAGE = spaces.Box(0, 255, (32, 32, 3), np.uint8)
@@ -77,7 +77,7 @@ def test_a_removed_renderer_that_drew_nothing_for_the_agent_is_replaced(
 ) -> None:
     run = Run.open(recorded(task, senses, renderer="warp"))
     assert run.config.env.renderer == "raster"
-    config, changes = taken_up(run.config, run.config)
+    config, changes = merge_resume_config(run.config, run.config)
     assert (config.env, changes) == (run.config.env, [])
 
 
@@ -87,4 +87,4 @@ def test_a_users_environment_resumes_whatever_the_preset_says_of_merls_own_tasks
     run = Run.open(recorded("Pendulum-v1", SENSES, image_size=48, renderer="gl"))
     asked = dataclasses.replace(compose("smoke", "Pendulum-v1"), run_dir=run.path)
     assert asked.env != run.config.env
-    assert taken_up(run.config, asked) == (run.config, [])
+    assert merge_resume_config(run.config, asked) == (run.config, [])

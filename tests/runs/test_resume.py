@@ -7,7 +7,7 @@ import pytest
 
 from merl.core import MerlError
 from merl.experiments.presets import compose
-from merl.runs.resume import taken_up
+from merl.runs.resume import merge_resume_config
 
 RECORDED = dataclasses.replace(
     compose("smoke", "move_box"), run_dir=Path("runs/mine"), threads=2, device="cpu", minutes=7.0
@@ -16,7 +16,7 @@ RECORDED = dataclasses.replace(
 
 def test_what_is_left_open_stays_as_the_run_decided() -> None:
     asked = dataclasses.replace(RECORDED, threads=None, device="auto", minutes=None)
-    config, changes = taken_up(RECORDED, asked)
+    config, changes = merge_resume_config(RECORDED, asked)
     assert config == dataclasses.replace(RECORDED, minutes=None)
     assert changes == []
 
@@ -30,7 +30,7 @@ def test_harmless_changes_are_taken_and_told() -> None:
         eval=dataclasses.replace(RECORDED.eval, every=250),
         agent=dataclasses.replace(RECORDED.agent, precision="bf16"),
     )
-    config, changes = taken_up(RECORDED, asked)
+    config, changes = merge_resume_config(RECORDED, asked)
     assert config == asked
     assert sorted(changes) == [
         "agent.precision auto -> bf16",
@@ -59,7 +59,7 @@ def test_harmless_changes_are_taken_and_told() -> None:
 )
 def test_what_makes_it_another_run_is_refused_by_name(asked, named) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(MerlError, match="run runs/mine cannot go on with") as caught:
-        taken_up(RECORDED, asked)
+        merge_resume_config(RECORDED, asked)
     for words in named:
         assert words in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -14,7 +14,7 @@ from merl.acting.rollout import Episode
 from merl.evaluation.evaluation import Evaluation, summarize
 from merl.training import console as console_module
 from merl.training.console import ConsoleView, describe, sparkline
-from merl.training.loop import Moment
+from merl.training.loop import StepResult
 
 METRICS = {
     "train/return": 12.34,
@@ -89,7 +89,7 @@ def watch(terminal: bool, width: int = 100, encoding: str = "utf-8") -> str:
     with ConsoleView(console, SCALE) as view:
         view.begin(new_run(), 0)
         for step in range(1, 251):
-            view.moment(Moment(step, step), METRICS if step == 250 else {})
+            view.moment(StepResult(step, step), METRICS if step == 250 else {})
         view.evaluating(0, 2)
         view.evaluated(250, summarize(episodes()))
         view.evaluated(251, evaluation_of(219.4))
@@ -133,7 +133,7 @@ def test_plain_lines_come_at_intervals_with_position_and_speed(clock: Clock) -> 
         view.begin(new_run(minutes=10.0), 0)
         for step, seconds in ((200, 10.0), (300, 25.0), (400, 31.0), (450, 40.0)):
             clock.seconds = 100.0 + seconds
-            view.moment(Moment(step, step - 100), METRICS)
+            view.moment(StepResult(step, step - 100), METRICS)
     (line,) = text_of(console).splitlines()
     assert line.startswith("00:31 of 10:00, or step 400 of 1,000 (40%, 01:03 left): training")
     assert line.endswith("noise); 33 steps/s, 17 updates/s")
@@ -153,7 +153,7 @@ def test_the_bar_runs_to_the_limit_that_is_reached_first(
 ) -> None:
     view = ConsoleView(console_of(terminal=False))
     view.begin(new_run(minutes=minutes), 0)
-    view.moment(Moment(step, 0), {})
+    view.moment(StepResult(step, 0), {})
     clock.seconds += seconds
     shown = drawn(view)
     assert shown.startswith(f"{percent} ")
@@ -166,14 +166,14 @@ def test_the_time_left_is_of_the_pace_with_updates(clock: Clock) -> None:
     view = ConsoleView(console_of(terminal=False))
     view.begin(new_run(), 0)
     clock.seconds += 10.0
-    view.moment(Moment(100, 0), {})
+    view.moment(StepResult(100, 0), {})
     assert "left" not in drawn(view)
-    view.moment(Moment(101, 1), {})
+    view.moment(StepResult(101, 1), {})
     clock.seconds += 100.0
-    view.moment(Moment(201, 101), {})  # a step a second
+    view.moment(StepResult(201, 101), {})  # a step a second
     assert "13:19 left" in drawn(view)
     clock.seconds += 800.0
-    view.moment(Moment(1000, 900), {})
+    view.moment(StepResult(1000, 900), {})
     assert "left" not in drawn(view)
 
 
@@ -182,7 +182,7 @@ def test_a_return_below_random_actions_is_explained() -> None:
     view.begin(new_run(), 0)
     assert "compare with random actions 7.8, scripted expert 219.4" in drawn(view)
     assert "below" not in drawn(view)
-    view.moment(Moment(50, 0), METRICS | {"train/return": 0.0})
+    view.moment(StepResult(50, 0), METRICS | {"train/return": 0.0})
     shown = drawn(view)
     assert "return 0.0" in shown
     assert "learning begins at step 100" in shown
@@ -204,7 +204,7 @@ def test_a_training_episode_without_success_counts_as_failed() -> None:
     view.begin(new_run(), 0)
     silent = {name: value for name, value in METRICS.items() if "success" not in name}
     for step, metrics in enumerate((METRICS, silent, silent, silent)):
-        view.moment(Moment(step, 0), metrics)
+        view.moment(StepResult(step, 0), metrics)
     assert "success 25%" in drawn(view)
 
 

@@ -131,7 +131,7 @@ def test_an_evaluation_that_is_killed_again_and_again_is_left_out(
         raise Killed
 
     unruly.in_evaluation = killed
-    monkeypatch.setattr("merl.envs.adapted.failing", contextlib.nullcontext)
+    monkeypatch.setattr("merl.envs.wrappers.failing", contextlib.nullcontext)
     with pytest.raises(Killed):
         train("--eval.every", "1000")
     for _ in range(ATTEMPTS - 1):

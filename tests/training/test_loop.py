@@ -8,16 +8,24 @@ import numpy as np
 import pytest
 import torch
 
-from merl.acting.environments import Here
+from merl.acting.environments import InProcessEnvs
 from merl.acting.rollout import Episode, Fetched, FrameStack, mean_metrics
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.config import TrainConfig
-from merl.replay import Lanes, ReplayConfig
+from merl.replay import ReplayBuffer, ReplayConfig
 from merl.replay.on_device import OnDevice
 from merl.training import loop
-from merl.training.loop import Moment, Progress, Randomness, Stage, Update, train, updates_due
+from merl.training.loop import (
+    Collector,
+    Progress,
+    Randomness,
+    StepResult,
+    Update,
+    train,
+    updates_due,
+)
 from merl.training.updating import UpdateFromHost, UpdateOnDevice, update_from_host
 from toy import DotEnv
 
@@ -43,17 +51,19 @@ class Parts:
         self.agent: DDPG = make_agent(
             config.agent, space, actions, frame_stack=3, seed=self.randomness.agent, device=CPU
         )
-        self.replay = Lanes(config.replay, space, actions, capacity=config.steps)
+        self.replay = ReplayBuffer(config.replay, space, actions, capacity=config.steps)
         self.progress = Progress()
         self.update: Update = update_from_host(self.agent, self.replay, self.randomness, config)
-        self.stage = Stage(Here(self.env), self.replay, [FrameStack(3, ("image",), CPU)])
+        self.stage = Collector(
+            InProcessEnvs(self.env), self.replay, [FrameStack(3, ("image",), CPU)]
+        )
 
-    def moments(self) -> Iterator[Moment]:
+    def moments(self) -> Iterator[StepResult]:
         return train(
             self.stage, self.agent, self.update, self.progress, self.randomness, self.config
         )
 
-    def run(self) -> list[Moment]:
+    def run(self) -> list[StepResult]:
         return list(self.moments())
 
     def weights(self) -> torch.Tensor:
@@ -68,7 +78,7 @@ def test_updates_per_step_are_held_exactly(hundredths: int) -> None:
     assert moment.step == 60
 
 
-def stopped_after(update: int, parts: Parts) -> Moment:
+def stopped_after(update: int, parts: Parts) -> StepResult:
     """The last thing that is told if a signal comes within that update."""
     stop, whole = False, parts.update
 
@@ -335,7 +345,7 @@ def test_on_the_device_the_same_is_learnt_from_the_same_batch(agent: MERLConfig)
     """What a GPU does, on the CPU: the twin learns from each batch on the host's way."""
     parts = Parts(dataclasses.replace(CONFIG, agent=agent))
     twin = Parts(parts.config).agent
-    copy = OnDevice(parts.replay.lanes, CPU)
+    copy = OnDevice(parts.replay.rings, CPU)
     on_device = UpdateOnDevice(parts.agent, copy, 8, seed=5)
     same = torch.Generator().manual_seed(5)
 

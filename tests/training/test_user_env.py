@@ -22,8 +22,8 @@ from merl.agents import AGENTS
 from merl.cli import main
 from merl.config import TrainConfig
 from merl.core import EnvironmentFailed, MerlError
-from merl.envs.adapted import adapt
 from merl.envs.config import UserEnvConfig
+from merl.envs.wrappers import adapt
 from merl.evaluation.evaluation import evaluate
 from merl.experiments.presets import compose
 from merl.report.curves import read_metrics
@@ -103,7 +103,7 @@ def config_of(agent: str, task: str = f"{here}:Arm", **values: Any) -> TrainConf
         ("merl_state", {}, [], ["joints", "state"], []),
         ("ddpg", {"vectors": ("state",)}, [], ["state"], []),
         ("merl", {"images": ("mask",), "vectors": ("joints",)}, ["mask"], ["joints"], []),
-        ("merl", {"critic_vectors": ("state",)}, ["mask", "pixels"], ["joints"], ["state"]),
+        ("merl", {"privileged": ("state",)}, ["mask", "pixels"], ["joints"], ["state"]),
     ],
 )
 def test_every_modality_is_used_and_the_rest_is_said(

@@ -34,7 +34,7 @@ from merl.config import TrainConfig
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
 from merl.core.output import tolerate_lost_output
 from merl.core.python_path import set_value, users_value, working_folder_hidden
-from merl.envs.own import imports_code, load_module, module_folder
+from merl.envs.user_env import imports_code, load_module, module_folder
 
 _INFO = ("success", "reward_terms")
 """What the loop wants to know beside the reward."""
@@ -59,7 +59,7 @@ class Step(NamedTuple):
     info: Mapping[str, Any]
 
 
-class Lost(Exception):  # noqa: N818 (no error as long as it can be mended)
+class WorkerDied(Exception):  # noqa: N818 (no error as long as it can be mended)
     """A process of an environment died or does not answer: the episodes in progress are lost."""
 
 
@@ -121,7 +121,7 @@ class Environments(Protocol):
         ...
 
 
-class Here:
+class InProcessEnvs:
     """One environment in this process: nothing happens between `send` and `receive`.
 
     Args:
@@ -168,7 +168,7 @@ class Here:
         """See `Environments`."""
 
 
-class Workers:
+class WorkerEnvs:
     """Environments in processes of their own, which step at the same time.
 
     They are spawned (a fork with OpenGL or with threads hangs), give their observations through
@@ -189,7 +189,7 @@ class Workers:
         self._lost: str | None = None  # what became of a process
         try:
             self._env = self._started()
-        except Lost as lost:
+        except WorkerDied as lost:
             raise EnvironmentsLost(
                 f"an environment's process {lost} while it was started: see what it said above"
             ) from None
@@ -243,9 +243,9 @@ class Workers:
 
     @contextmanager
     def _loss(self) -> Iterator[None]:
-        """What is left of a process that has gone, as `Lost`; nothing is asked until a restart."""
+        """Raise `WorkerDied` for a process that has died; ask nothing more until a restart."""
         if self._lost is not None:
-            raise Lost(self._lost)
+            raise WorkerDied(self._lost)
         try:
             yield
         except multiprocessing.TimeoutError:
@@ -256,7 +256,7 @@ class Workers:
             self._lost = "failed"  # its pipe is closed: nothing more can be asked of it
             raise
         if self._lost is not None:
-            raise Lost(self._lost)
+            raise WorkerDied(self._lost)
 
     def _call(self, name: str, *args: Any) -> tuple[Any, ...]:
         with self._loss():

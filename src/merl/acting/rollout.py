@@ -18,7 +18,7 @@ from merl.core import Observation
 class FrameStack:
     """The last frames of every image, for the one who acts.
 
-    Replay keeps single frames and stacks them itself; this is the same stack at acting time: at
+    The replay keeps single frames and stacks them itself; this is the same stack at acting time: at
     an episode's start the first frame is repeated.
     """
 

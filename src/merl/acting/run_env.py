@@ -17,14 +17,14 @@ from gymnasium.wrappers import FilterObservation
 from merl.acting.env_checks import refuse_running_statistics
 from merl.acting.generators import global_state, set_global_state
 from merl.agents.config import AgentConfig
-from merl.agents.networks import modalities, told_to_critic
+from merl.agents.networks import modalities, privileged_keys
 from merl.config import TrainConfig
 from merl.core import MerlError, is_image
 from merl.core.signals import handlers_kept
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
 from merl.envs.config import OBSERVATIONS, EnvConfig
-from merl.envs.own import make_own
+from merl.envs.user_env import make_user_env
 from merl.envs.user_spaces import brief
 
 
@@ -46,7 +46,7 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
                 "how it is seen"
             )
         with handlers_kept():
-            env = Supervised(make_own(config.task, render_mode, config.user_env))
+            env = Supervised(make_user_env(config.task, render_mode, config.user_env))
         refuse_running_statistics(env)
     else:
         seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))
@@ -100,7 +100,7 @@ def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[space
     assert isinstance(space, spaces.Dict)
     assert isinstance(env.action_space, spaces.Box)
     images, vectors = modalities(config.agent, space)
-    keys = (*images, *vectors, *told_to_critic(config.agent, space))
+    keys = (*images, *vectors, *privileged_keys(config.agent, space))
     return spaces.Dict({key: space[key] for key in keys}), env.action_space
 
 
@@ -184,7 +184,7 @@ def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
     groups = {
         "images used": images,
         "vectors used": vectors,
-        "vectors used by the critic alone": told_to_critic(config.agent, space),
+        "vectors used by the critic alone": privileged_keys(config.agent, space),
     }
     lines = [
         f"{group}: {', '.join(f'{key} ({_size(space[key])})' for key in keys)}"
@@ -260,7 +260,7 @@ def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
         for name in env.observations
         if (images is None if name == "image" else vectors is None and name != "state")
     ]
-    named = {*(images or ()), *(vectors or ()), *agent.critic_vectors}
+    named = {*(images or ()), *(vectors or ()), *agent.privileged}
     if not named <= set(OBSERVATIONS):  # the agent's check says which there are
         return OBSERVATIONS
     asked = [name for name in OBSERVATIONS if name in named or name in default]

@@ -30,7 +30,7 @@ class AgentConfig:
     vectors: tuple[str, ...] | None = None
     """Vector keys to feel; if not set, every one that the environment gives and that is not for the
     critic alone. Of merl's own tasks `state` is used only if it is named."""
-    critic_vectors: tuple[str, ...] = ()
+    privileged: tuple[str, ...] = ()
     """Vector keys that the critic alone is told, e.g. `state`: what is known in training only."""
     learning_rate: float = 1e-4
     """Adam's step size, for every network."""

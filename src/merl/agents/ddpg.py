@@ -21,12 +21,12 @@ from torch import Tensor, nn
 
 from merl.agents.compiling import compile_parts
 from merl.agents.config import AgentConfig
-from merl.agents.draws import Draws
 from merl.agents.gradients import clamp_straight_through, frozen
 from merl.agents.networks import Networks
 from merl.agents.optimizers import adam, load_optimizer, step_optimizer
-from merl.core import Batch, Copies
-from merl.networks.augmentation import Crop, draw_shifts
+from merl.agents.update_noise import UpdateNoise
+from merl.core import Batch, FrameTransforms
+from merl.networks.augmentation import RandomShift, draw_shifts
 from merl.networks.critic import TwinCritic
 from merl.networks.settings import with_torch_settings
 
@@ -133,7 +133,7 @@ class DDPG:
         return self.learn(batch.to(self.device), self.draw(len(batch.action)))
 
     @with_torch_settings
-    def learn(self, batch: Batch, draws: Draws) -> dict[str, Tensor]:
+    def learn(self, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
         """Augment and encode; then one step of the critic, of the actor if due, of the target."""
         encoders = self.networks.encoders
         encoders.observe(batch.observation)
@@ -222,7 +222,7 @@ class DDPG:
         torch._foreach_lerp_(average, recent, self.config.tau)
 
     @with_torch_settings
-    def draw(self, size: int) -> Draws:
+    def draw(self, size: int) -> UpdateNoise:
         """The random numbers of the next update, from a batch of so many samples."""
         generator = self.learning
         pad, shape = self.networks.encoders.pad, (size, self.networks.actor.action_dim)
@@ -234,13 +234,13 @@ class DDPG:
             self.epsilon(torch.randn(shape, generator=generator, device=self.device))
             for _ in range(2)
         )
-        return Draws(shifts, next_shifts, next_noise, noise)
+        return UpdateNoise(shifts, next_shifts, next_noise, noise)
 
-    def copies(self, draws: Draws) -> tuple[Copies, Copies]:
+    def copies(self, draws: UpdateNoise) -> tuple[FrameTransforms, FrameTransforms]:
         """The draws' shifts of o_t and o_{t+n}, for a replay that applies them when it samples."""
         pad = self.networks.encoders.pad
         now, then = (
-            {key: Crop(shifts, pad) for key, shifts in each.items()}
+            {key: RandomShift(shifts, pad) for key, shifts in each.items()}
             for each in (draws.shifts, draws.next_shifts)
         )
         return now, then

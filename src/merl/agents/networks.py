@@ -14,7 +14,7 @@ from merl.agents.config import AgentConfig
 from merl.core import MerlError, is_image, is_vector
 from merl.networks.critic import TwinCritic
 from merl.networks.encoders import ConvEncoder, VectorEncoder
-from merl.networks.fusion import SIMPLEX_GROUP, Concatenation, Fusion
+from merl.networks.fusion import SIMNORM_GROUP, Concatenation, Fusion
 from merl.networks.heads import Actor, GaussianActor, HeadSize
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
@@ -117,7 +117,7 @@ def make_networks(
         {key: _image_encoder(config, key, space[key], stack) for key in images},
         {
             key: _vector_encoder(config, space[key])
-            for key in (*vectors, *told_to_critic(config, space))
+            for key in (*vectors, *privileged_keys(config, space))
         },
         pad=config.shift_pad,
     )
@@ -147,7 +147,7 @@ def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...]
     """
     images = _keys("images", config.images, [k for k, s in space.items() if is_image(s)])
     given = [k for k, s in space.items() if is_vector(s)]
-    actors = [key for key in given if key not in config.critic_vectors]
+    actors = [key for key in given if key not in config.privileged]
     vectors = _keys("vectors", config.vectors, given, default=actors)
     if not images and not vectors:
         if config.vectors == () and config.images == ():
@@ -156,7 +156,7 @@ def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...]
             others = "merl_state, ddpg or sac" if given == ["state"] else "proprio"
             hint = f"it needs an image, a uint8 box (H, W, C), or take --agent {others}"
         elif given:
-            hint = "--agent.critic-vectors leaves the actor nothing"
+            hint = "--agent.privileged leaves the actor nothing"
         elif config.images == ():
             hint = "it needs a vector, a box of n numbers, or take --agent drqv2"
         else:
@@ -165,21 +165,21 @@ def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...]
     return images, vectors
 
 
-def told_to_critic(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
+def privileged_keys(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
     """The vector keys that the critic has beyond the actor's.
 
     Raises:
         MerlError: a key is missing, is the actor's too, or the fusion is shared.
     """
     given = [k for k, s in space.items() if is_vector(s)]
-    keys = _keys("critic-vectors", config.critic_vectors, given)
+    keys = _keys("privileged", config.privileged, given)
     _, vectors = modalities(config, space)
     for key in keys:
         if key in vectors:
-            raise MerlError(f"agent.critic-vectors names {key!r}, which the actor has already")
+            raise MerlError(f"agent.privileged names {key!r}, which the actor has already")
     if keys and config.fusion != "decoupled":
         raise MerlError(
-            f"agent.critic-vectors {keys} needs a fusion of the critic's own: use --agent.fusion "
+            f"agent.privileged {keys} needs a fusion of the critic's own: use --agent.fusion "
             f"decoupled in place of {config.fusion}"
         )
     return keys
@@ -189,7 +189,7 @@ def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
     """What each modality has of d, rounded down; with an informed critic, what the actor's have.
 
     Raises:
-        MerlError: d is too small for so many, or for the groups of `simplex`.
+        MerlError: d is too small for so many, or for the groups of `simnorm`.
     """
     share = config.latent_dim // len(senses)
     # Of a single number LayerNorm leaves nothing.
@@ -198,10 +198,10 @@ def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
             f"agent.latent-dim {config.latent_dim} leaves {share} for each of {len(senses)} "
             f"modalities ({', '.join(senses)}): use at least {LEAST_SHARE * len(senses)}"
         )
-    if config.squash == "simplex" and share % SIMPLEX_GROUP:
+    if config.squash == "simnorm" and share % SIMNORM_GROUP:
         raise MerlError(
-            f"agent.squash simplex needs a multiple of {SIMPLEX_GROUP} per modality, not {share}: "
-            f"use agent.latent-dim {SIMPLEX_GROUP * len(senses)} or a multiple"
+            f"agent.squash simnorm needs a multiple of {SIMNORM_GROUP} per modality, not {share}: "
+            f"use agent.latent-dim {SIMNORM_GROUP * len(senses)} or a multiple"
         )
     return share
 

@@ -17,11 +17,11 @@ from rich.table import Table
 from torch import Tensor
 
 from merl.bench.measuring import Work, circumstances, seconds, shown, spread, take_turns
-from merl.core import Copies, MerlError, Transition
+from merl.core import FrameTransforms, MerlError, Transition
 from merl.core.resources import free_disk
 from merl.envs import make_env
-from merl.networks.augmentation import Crop, draw_shifts, to_input
-from merl.replay import Replay, ReplayConfig, replay_bytes
+from merl.networks.augmentation import RandomShift, draw_shifts, to_input
+from merl.replay import EpisodeRing, ReplayConfig, replay_bytes
 
 EPISODE, PAD, MILLION = 250, 4, 1_000_000
 RAW, COMPRESSED = "raw", "compressed (--replay.compress)"
@@ -84,14 +84,14 @@ def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
     }
     with tempfile.TemporaryDirectory() as folder:
         _check_room(Path(folder), space, actions, steps)
-        rings: dict[str, Replay] = {}
+        rings: dict[str, EpisodeRing] = {}
         writing, sizes = {}, {}
         for side in BARS_MS:
             config = ReplayConfig(
                 capacity=steps, batch_size=batch_size, compress=side == COMPRESSED
             )
             directory = Path(folder) / str(len(rings))
-            rings[side] = Replay(config, space, actions, directory=directory)
+            rings[side] = EpisodeRing(config, space, actions, directory=directory)
             writing[side] = _fill(rings[side], seen, actions, steps)
             sizes[side] = _mean_bytes(directory, space)
         taken = take_turns(
@@ -146,7 +146,9 @@ def _pictures() -> tuple[spaces.Dict, spaces.Box, list[dict[str, Any]]]:
     return space, actions, seen
 
 
-def _fill(ring: Replay, seen: list[dict[str, Any]], actions: spaces.Box, steps: int) -> list[float]:
+def _fill(
+    ring: EpisodeRing, seen: list[dict[str, Any]], actions: spaces.Box, steps: int
+) -> list[float]:
     """Write the observations over and over; microseconds a step, by episode."""
     action = actions.sample().astype(np.float32)
     taken: list[float] = []
@@ -171,17 +173,17 @@ def _mean_bytes(directory: Path, space: spaces.Dict) -> float:
     return float(lengths[lengths > 0].mean())
 
 
-def _stages(ring: Replay, batch_size: int) -> dict[str, Work]:
+def _stages(ring: EpisodeRing, batch_size: int) -> dict[str, Work]:
     """A batch, as far as each of `STAGES`."""
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
 
-    def sample(*copies: Copies) -> list[Tensor]:
+    def sample(*copies: FrameTransforms) -> list[Tensor]:
         batch = ring.sample(batch_size, rng, *copies)
         return [batch.observation["image"], batch.next_observation["image"]]
 
     def ready() -> list[Tensor]:
         shifts = (draw_shifts(batch_size, PAD, generator) for _ in range(2))
-        return sample(*({"image": Crop(each, PAD)} for each in shifts))
+        return sample(*({"image": RandomShift(each, PAD)} for each in shifts))
 
     def as_input() -> list[Tensor]:
         return [to_input(stack, torch.float32) for stack in ready()]

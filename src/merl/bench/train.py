@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from merl.acting.environments import Environments, Here, Workers
+from merl.acting.environments import Environments, InProcessEnvs, WorkerEnvs
 from merl.acting.rollout import FrameStack
 from merl.acting.run_env import make_run_env, run_spaces
 from merl.agents import make_agent
@@ -25,8 +25,8 @@ from merl.config import TrainConfig
 from merl.core import counted, is_image
 from merl.core.resources import keep_freed_memory
 from merl.experiments.presets import compose
-from merl.replay import Lanes
-from merl.training.loop import Progress, Randomness, Stage, train
+from merl.replay import ReplayBuffer
+from merl.training.loop import Collector, Progress, Randomness, train
 from merl.training.parts import choose_device
 from merl.training.timing import measure, use_threads
 from merl.training.updating import make_update
@@ -147,16 +147,18 @@ class _Loop:
         env = make_run_env(config)
         stack.callback(env.close)
         space, actions = run_spaces(config, env)
-        environments: Environments = Workers(config, env) if config.has_workers else Here(env)
+        environments: Environments = (
+            WorkerEnvs(config, env) if config.has_workers else InProcessEnvs(env)
+        )
         stack.callback(environments.close)
         device, frames = choose_device(config.device), config.replay.frame_stack
         images = tuple(key for key in space if is_image(space[key]))
         count = environments.count
-        replay = Lanes(config.replay, space, actions, count=count, capacity=CAPACITY)
+        replay = ReplayBuffer(config.replay, space, actions, count=count, capacity=CAPACITY)
         stacks = [FrameStack(frames, images, device) for _ in range(count)]
         agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)
         self._progress = Progress()
-        stage = Stage(environments, replay, stacks)
+        stage = Collector(environments, replay, stacks)
         randomness = Randomness(config.seed)
         update = make_update(agent, replay, randomness, config, lambda _: None)
         self._moments = train(stage, agent, update, self._progress, randomness, config)

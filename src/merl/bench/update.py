@@ -22,7 +22,7 @@ from merl.agents.ddpg import DDPG
 from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
 from merl.bench.plain import Encoder, Plain, Sample
 from merl.core import Batch, MerlError, Transition, counted
-from merl.replay import Replay, ReplayConfig
+from merl.replay import EpisodeRing, ReplayConfig
 from merl.replay.on_device import OnDevice
 from merl.training.parts import choose_device
 from merl.training.timing import Arithmetic
@@ -193,10 +193,10 @@ def learner_of(
     return make_agent(config, space_of(side), actions, frame_stack=STACK, seed=0, device=device)
 
 
-def noise_replay(steps: int = 2000) -> Replay:
+def noise_replay(steps: int = 2000) -> EpisodeRing:
     """A replay of noise, in episodes of 250 steps."""
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
-    replay = Replay(ReplayConfig(), space_of(), actions, capacity=steps)
+    replay = EpisodeRing(ReplayConfig(), space_of(), actions, capacity=steps)
     rng = np.random.default_rng(0)
     for step in range(steps):
         seen = {

@@ -21,7 +21,7 @@ from importlib import import_module
 from typing import Any
 
 import merl
-from merl.core import MerlError, meant
+from merl.core import MerlError, suggest
 from merl.core.output import tolerant_output
 from merl.core.python_path import working_folder_hidden
 
@@ -79,7 +79,7 @@ def _run(args: list[str]) -> int:
             print(f"merl {merl.__version__}")
             return 0
         if args[0] not in COMMANDS:
-            raise MerlError(f"command {args[0]!r} is unknown: {meant(args[0], COMMANDS)}")
+            raise MerlError(f"command {args[0]!r} is unknown: {suggest(args[0], COMMANDS)}")
         module, name, _ = COMMANDS[args[0]]
         code: int = getattr(import_module(module), name)(args[1:])
         return code

@@ -7,7 +7,7 @@ from pathlib import Path
 from merl.bench import BENCHES
 from merl.cli.output import make_console
 from merl.cli.parsing import check_writable, parse, write_json
-from merl.core import MerlError, meant
+from merl.core import MerlError, suggest
 
 
 def bench(args: list[str]) -> int:
@@ -16,7 +16,7 @@ def bench(args: list[str]) -> int:
         print(f"usage: merl bench {{{','.join(BENCHES)}}} [--repeats N] [--json FILE]")
         return 0
     if args[0] not in BENCHES:
-        raise MerlError(f"bench {args[0]!r} is unknown: {meant(args[0], BENCHES)}")
+        raise MerlError(f"bench {args[0]!r} is unknown: {suggest(args[0], BENCHES)}")
 
     def command(repeats: int = 5, json: Path | None = None) -> tuple[int, Path | None]:
         """Interleaved repeats on the same work, medians and their spread.

@@ -13,7 +13,7 @@ from merl.config import TrainConfig
 from merl.core import counted
 from merl.evaluation.evaluation import Evaluation
 from merl.training.console import ConsoleView
-from merl.training.loop import Moment
+from merl.training.loop import StepResult
 from merl.training.parts import Parts
 from merl.training.timing import Timing
 
@@ -57,10 +57,10 @@ class DurationView(ConsoleView):
     def __init__(self, console: Console, parts: Parts, scale: Mapping[str, float]) -> None:
         super().__init__(console, scale)
         self._config, self._timing = parts.config, parts.timing
-        self._first: tuple[float, Moment] | None = None  # the time of the first step
+        self._first: tuple[float, StepResult] | None = None  # the time of the first step
         self._is_said = False
 
-    def moment(self, moment: Moment, metrics: dict[str, float]) -> None:
+    def moment(self, moment: StepResult, metrics: dict[str, float]) -> None:
         """See `stretch.View`."""
         super().moment(moment, metrics)
         if self._is_said:

@@ -19,7 +19,7 @@ from merl.core import MerlError, NotSaved, counted, is_image
 from merl.replay import replay_bytes
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint, readable
-from merl.runs.resume import REOPENED, left_open, reopened, taken_up
+from merl.runs.resume import REOPENED, left_open, merge_resume_config, reopened
 from merl.runs.run import Run
 from merl.runs.run_folder import check_links, resume_line
 from merl.training import trainer
@@ -63,7 +63,7 @@ def go_on(
     """
     if asked.device == "auto" and "device" in given_open:
         asked = dataclasses.replace(asked, device=device_name("auto"))
-    config, changes = taken_up(run.config, asked, given_open)
+    config, changes = merge_resume_config(run.config, asked, given_open)
     fixed = {name for name in REOPENED if name not in left_open(asked)}
     run = dataclasses.replace(
         run,

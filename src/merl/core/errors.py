@@ -46,7 +46,7 @@ class EvaluationFailed(MerlError):  # noqa: N818 (what happened, not a mistake)
     exit_code = 4
 
 
-def meant(name: str, known: Iterable[str], closeness: float = 0.6) -> str:
+def suggest(name: str, known: Iterable[str], closeness: float = 0.6) -> str:
     """Return the way out of a name that is unknown: what was perhaps meant, or all that there is.
 
     Args:
@@ -71,4 +71,4 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         MerlError: naming the value and the choices.
     """
     if value not in choices:
-        raise MerlError(f"{name} {value!r} is unknown: {meant(str(value), choices)}")
+        raise MerlError(f"{name} {value!r} is unknown: {suggest(str(value), choices)}")

@@ -14,7 +14,7 @@ from merl.core import NotFinite, Observation
 _NEVER = torch.iinfo(torch.int64).max
 
 
-def check_moment(observation: Observation, reward: float, step: int, where: str = "") -> None:
+def check_finite(observation: Observation, reward: float, step: int, where: str = "") -> None:
     """What an environment gave, before it enters the replay.
 
     Args:

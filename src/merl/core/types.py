@@ -22,10 +22,10 @@ Observation = Mapping[str, NDArray[Any]]
 """One moment as the senses give it, a key per modality: an image is uint8 (H, W, C), a vector
 float32 (n,). Frames are single; stacks are made by the actor and by replay."""
 
-Copy = Callable[[int, NDArray[np.uint8], NDArray[np.uint8]], None]
+FrameTransform = Callable[[int, NDArray[np.uint8], NDArray[np.uint8]], None]
 """How a stack of frames is taken out of the replay for a batch: told are the sample's number in the
 batch, the frames (K, H, W, C), and where they are to go."""
-Copies = Mapping[str, Copy]
+FrameTransforms = Mapping[str, FrameTransform]
 """By image key."""
 
 CONFIG_FILE = "config.json"

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from merl.core import MerlError, meant
+from merl.core import MerlError, suggest
 from merl.envs.config import EnvConfig
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
     known = [field.name for field in fields(EnvConfig)]
     for name in config:
         if name not in known:
-            raise MerlError(f"make_env has no setting {name!r}: {meant(name, known)}")
+            raise MerlError(f"make_env has no setting {name!r}: {suggest(name, known)}")
     settings = EnvConfig(**config)
     from merl.envs.jaco_env import JacoEnv
     from merl.tasks import make_task

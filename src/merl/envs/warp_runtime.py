@@ -75,13 +75,13 @@ def _told_if_it_takes_long(seconds: float) -> Iterator[threading.Thread]:
 
 def _kernel_cache() -> Path:
     """A folder of our own that can be written: in the user's cache, else among temporary files."""
-    places = [Path(tempfile.gettempdir()) / f"merl-warp-{os.getuid()}"]
+    ring_index = [Path(tempfile.gettempdir()) / f"merl-warp-{os.getuid()}"]
     with suppress(RuntimeError):  # there may be no home
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        places.insert(0, home / "merl" / "warp")
+        ring_index.insert(0, home / "merl" / "warp")
     if "WARP_CACHE_PATH" in os.environ:
-        places.insert(0, Path(os.environ["WARP_CACHE_PATH"]))
-    for place in places:
+        ring_index.insert(0, Path(os.environ["WARP_CACHE_PATH"]))
+    for place in ring_index:
         with suppress(OSError):
             place.mkdir(mode=0o700, parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=place):

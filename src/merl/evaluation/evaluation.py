@@ -23,7 +23,7 @@ from merl.acting.run_env import make_run_env, own_bounds, run_spaces
 from merl.agents import make_agent
 from merl.config import EvaluationConfig, TrainConfig
 from merl.core import Agent, MerlError, NotFinite, Observation, is_image
-from merl.core.guards import check_moment
+from merl.core.guards import check_finite
 from merl.core.statistics import Interval, bootstrap_interval, wilson_interval
 from merl.envs.user_spaces import Modality
 from merl.evaluation.recording import EpisodeVideo, warn_user
@@ -275,7 +275,7 @@ def _run_episode(
     try:
         while not over and episode.length < max_steps:
             observation, reward, terminated, truncated, info = env.step(act(observation))
-            check_moment(observation, float(reward), episode.length + 1, "of an evaluation")
+            check_finite(observation, float(reward), episode.length + 1, "of an evaluation")
             episode.add(float(reward), info)
             over = bool(terminated or truncated)
             if film is not None:

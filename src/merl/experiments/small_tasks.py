@@ -16,12 +16,12 @@ import numpy as np
 from merl.agents import AGENTS
 from merl.config import EvaluationConfig, TrainConfig
 from merl.envs.config import EnvConfig
-from merl.envs.own import make_own
+from merl.envs.user_env import make_user_env
 from merl.evaluation.evaluation import EVALUATION_SEED, Evaluation
 from merl.replay import ReplayConfig
 from merl.runs.run import Run
 from merl.training import trainer
-from merl.training.loop import Moment
+from merl.training.loop import StepResult
 from merl.training.parts import Parts
 
 WHOLE, SPLIT, PENDULUM = "merl.envs.dot:whole", "merl.envs.dot:split", "Pendulum-v1"
@@ -99,7 +99,7 @@ def learn(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> Eval
 
 def returns_of(act: Callable[[Any], Any], task: str, episodes: int = 20) -> list[float]:
     """What acting so is paid, from the evaluation's starts; `act` is given the environment."""
-    env = make_own(task)
+    env = make_user_env(task)
     returns = []
     for index in range(episodes):
         env.reset(seed=EVALUATION_SEED + index)
@@ -123,7 +123,7 @@ class Silent:
     def begin(self, run: Run, step: int) -> None:
         """See `stretch.View`."""
 
-    def moment(self, moment: Moment, metrics: dict[str, float]) -> None:
+    def moment(self, moment: StepResult, metrics: dict[str, float]) -> None:
         """See `stretch.View`."""
 
     def evaluating(self, episode: int, total: int) -> None:

@@ -32,14 +32,14 @@ def shift(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
     if images.device.type != "cpu":
         return _shift_by_index(images, shifts, pad)
     shifted = torch.empty_like(images, memory_format=torch.contiguous_format)
-    crop = Crop(shifts, pad)
+    crop = RandomShift(shifts, pad)
     for sample, (frames, out) in enumerate(zip(images.numpy(), shifted.numpy(), strict=True)):
         crop(sample, frames, out)
     return shifted
 
 
-class Crop:
-    """`shift` sample by sample, for who copies the frames anyway: see `core.Copy`.
+class RandomShift:
+    """`shift` sample by sample, for who copies the frames anyway: see `core.FrameTransform`.
 
     Args:
         shifts: int64 (B, 2), from `draw_shifts`.

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from merl.networks.names import module_name
 
-Squash = Literal["tanh", "simplex"]
-SIMPLEX_GROUP = 8  # features that share one softmax, as in SimNorm (TD-MPC2)
+Squash = Literal["tanh", "simnorm"]
+SIMNORM_GROUP = 8  # features that share one softmax, as in SimNorm (TD-MPC2)
 
 
 class Fusion(nn.Module):
@@ -19,9 +19,9 @@ class Fusion(nn.Module):
 
     Args:
         features: the length of each modality's encoding, by key, in the order of concatenation.
-        share: what each modality has of the whole, numbers; with simplex a multiple of eight.
+        share: what each modality has of the whole, numbers; with simnorm a multiple of eight.
         layer_norm: whether to normalise (the paper's Figure 3c switches it off).
-        squash: "tanh", or "simplex" for a softmax over groups of eight.
+        squash: "tanh", or "simnorm" for a softmax over groups of eight.
 
     Attributes:
         latent_dim: d, the length of the whole.
@@ -61,7 +61,7 @@ class Fusion(nn.Module):
     def _squash(self, latent: Tensor) -> Tensor:
         if self.squash == "tanh":
             return torch.tanh(latent)
-        groups = latent.reshape(len(latent), -1, SIMPLEX_GROUP)
+        groups = latent.reshape(len(latent), -1, SIMNORM_GROUP)
         return torch.softmax(groups, dim=-1).flatten(-2)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.replay.backgrounds import Backgrounds
-from merl.replay.places import Places
+from merl.replay.ring_index import RingIndex
 
 
 def reserved_bytes(picture_bytes: int) -> int:
@@ -34,8 +34,8 @@ SLOTS_OF_ANY_PICTURE = 5
 class CompressedPictures:
     """The pictures of one key.
 
-    A position in the ring counts on and on; `places` says where its byte lies. No picture reaches
-    across the end.
+    Positions in the ring keep counting up; `ring_index` says where the byte of one lies. No image
+    crosses the end of the ring.
 
     Args:
         ring: the bytes.
@@ -51,13 +51,13 @@ class CompressedPictures:
     def __init__(
         self,
         ring: NDArray[np.uint8],
-        places: Places,
+        ring_index: RingIndex,
         spans: NDArray[np.int64],
         shape: tuple[int, ...],
         starts: Path | None,
     ) -> None:
         self.shape = shape
-        self._ring, self._places, self._spans = ring, places, spans
+        self._ring, self._places, self._spans = ring, ring_index, spans
         self._size = int(np.prod(shape))
         self._head = 0  # where the next picture may begin
         self.backgrounds = Backgrounds(self._size, starts)

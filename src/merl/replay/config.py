@@ -61,21 +61,21 @@ def replay_bytes(
     observation_space: gymnasium.spaces.Dict,
     action_space: gymnasium.spaces.Box,
     capacity: int | None = None,
-    lanes: int = 1,
+    rings: int = 1,
 ) -> int:
     """Bytes that a replay takes, on disk or in memory.
 
     Args:
         config: what is kept.
-        observation_space: see `Replay`.
-        action_space: see `Replay`.
+        observation_space: see `EpisodeRing`.
+        action_space: see `EpisodeRing`.
         capacity: steps, in place of the config's.
-        lanes: rings that share them.
+        rings: rings that share them.
     """
     steps = config.capacity if capacity is None else capacity
     fields = fields_of(observation_space, action_space, config.compress)
     slot = sum(field.bytes for field in fields.values())
-    return slot * lanes * slots_for(config, lane_capacity(steps, lanes))
+    return slot * rings * slots_for(config, ring_capacity(steps, rings))
 
 
 def check_fits(
@@ -85,7 +85,7 @@ def check_fits(
     *,
     directory: Path | None = None,
     capacity: int | None = None,
-    lanes: int = 1,
+    rings: int = 1,
 ) -> None:
     """Refuse a replay that the disk or the memory cannot hold, before anything is created.
 
@@ -93,11 +93,11 @@ def check_fits(
 
     Args:
         config: what is kept.
-        observation_space: see `Replay`.
-        action_space: see `Replay`.
+        observation_space: see `EpisodeRing`.
+        action_space: see `EpisodeRing`.
         directory: where it is to lie, or lies already; in memory, if not given.
         capacity: steps, in place of the config's.
-        lanes: rings that share them.
+        rings: rings that share them.
 
     Raises:
         MerlError: it does not fit: the message names the largest capacity that would.
@@ -105,7 +105,7 @@ def check_fits(
     steps = config.capacity if capacity is None else capacity
 
     def bytes_of(config: ReplayConfig, steps: int) -> int:
-        return replay_bytes(config, observation_space, action_space, steps, lanes)
+        return replay_bytes(config, observation_space, action_space, steps, rings)
 
     room = {"of memory are available": available_memory()}
     if directory is not None:
@@ -118,15 +118,15 @@ def check_fits(
         raise _too_large(config, steps, bytes_of, what, least)
 
 
-def lane_capacity(steps: int, lanes: int) -> int:
+def ring_capacity(steps: int, rings: int) -> int:
     """Steps of one of so many rings that share them."""
-    return math.ceil(steps / lanes)
+    return math.ceil(steps / rings)
 
 
 def slots_for(config: ReplayConfig, capacity: int) -> int:
-    """Moments that hold `capacity` steps of episodes of two hundred steps or more.
+    """Timesteps that hold `capacity` steps of episodes of two hundred steps or more.
 
-    An episode has one moment more than steps, and the oldest step needs its whole stack. Episodes
+    An episode has one timestep more than steps, and the oldest step needs its whole stack. Episodes
     that are shorter fill the slots before the capacity is reached. There is always room for one
     step and the beginning of the next episode, even of pictures that no compression makes smaller.
     """

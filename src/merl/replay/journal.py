@@ -1,7 +1,7 @@
 """What a ring overwrote since the last checkpoint, so that a run can go back to it exactly.
 
-A ring that has wrapped writes over its oldest moments, which the last checkpoint still counted on.
-Each of these is appended to `overwritten.journal` before: the number of the moment that takes its
+A ring that has wrapped overwrites its oldest timesteps, which the last checkpoint still refers to.
+Each of these is appended to `overwritten.journal` before: the number of the timestep that takes its
 place, the fields of its slot, and its compressed pictures. A checkpoint that is on the disk empties
 the file.
 """
@@ -19,19 +19,19 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError
 from merl.replay.compression import CompressedPictures
-from merl.replay.places import Places
+from merl.replay.ring_index import RingIndex
 
 _FILE = "overwritten.journal"
 _LOG = logging.getLogger(__name__)
 
 
 class Journal:
-    """The overwritten moments, in the order in which they were.
+    """The overwritten timesteps, in the order in which they were.
 
     Args:
         directory: the ring's.
         data: the ring's arrays, (slots, *shape) each.
-        places: where in them entry number moment - 1 lies.
+        places: where in them entry number timestep - 1 lies.
         pictures: its compressed pictures, by the name of their field.
 
     Raises:
@@ -42,10 +42,10 @@ class Journal:
         self,
         directory: Path,
         data: Mapping[str, NDArray[Any]],
-        places: Places,
+        ring_index: RingIndex,
         pictures: Mapping[str, CompressedPictures],
     ) -> None:
-        self._data, self._places, self._pictures = data, places, pictures
+        self._data, self._places, self._pictures = data, ring_index, pictures
         fields = [("by", "<i8"), *((name, a.dtype, a.shape[1:]) for name, a in data.items())]
         self._row = np.zeros(1, np.dtype(fields))  # without padding: bytes as they lie in the file
         self._kept = True
@@ -56,7 +56,7 @@ class Journal:
             raise MerlError(f"cannot keep a replay in {directory}: {error.strerror}") from None
 
     def keep(self, slot: int, by: int) -> None:
-        """Remember what a slot has, which moment number `by` is about to overwrite.
+        """Remember what a slot has, which timestep number `by` is about to overwrite.
 
         Where that cannot be written (a full disk), it is told once, and what is overwritten until
         the next checkpoint would be missing if the run went back to the last one.
@@ -81,15 +81,15 @@ class Journal:
                 "what the replay overwrites is not kept until the next checkpoint (%s)", reason
             )
 
-    def holds(self, moment: int) -> bool:
-        """Whether a moment of that number was overwritten, and can be put back."""
-        return any(row["moment"] == moment for row, _ in self._records())
+    def holds(self, timestep: int) -> bool:
+        """Whether a timestep of that number was overwritten, and can be put back."""
+        return any(row["timestep"] == timestep for row, _ in self._records())
 
-    def undo(self, moments: int) -> None:
-        """Put back what moments after number `moments` have overwritten, the newest first."""
+    def undo(self, timesteps: int) -> None:
+        """Put back what timesteps after number `timesteps` have overwritten, the newest first."""
         for row, pictures in reversed(list(self._records())):
-            if row["by"] > moments:
-                slot = self._places.of(int(row["moment"]) - 1)
+            if row["by"] > timesteps:
+                slot = self._places.of(int(row["timestep"]) - 1)
                 for name, array in self._data.items():
                     array[slot] = row[name]
                 for name, kept in pictures.items():

@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from merl.core import Batch
-from merl.replay.ring import Replay
+from merl.replay.ring import EpisodeRing
 from merl.replay.sampling import Sampler
 
 CHUNK = 4096
 """Slots that are brought over at once, at most."""
 
 
-def bytes_on_device(rings: Sequence[Replay]) -> int:
+def bytes_on_device(rings: Sequence[EpisodeRing]) -> int:
     """What the copy takes."""
     return sum(array.nbytes for ring in rings for array in ring.arrays().values())
 
@@ -34,11 +34,11 @@ class OnDevice:
         device: where the copy lies.
     """
 
-    def __init__(self, rings: Sequence[Replay], device: torch.device) -> None:
+    def __init__(self, rings: Sequence[EpisodeRing], device: torch.device) -> None:
         first = rings[0]
         self._rings, self._device = rings, device
         self._keys, self._capacity = first.keys, first.capacity
-        lengths = [ring.places.length for ring in rings]
+        lengths = [ring.ring_index.length for ring in rings]
         self._first_slots = [sum(lengths[:index]) for index in range(len(rings))]
         self._bases = torch.tensor(self._first_slots, device=device)
         self._slots = torch.tensor(lengths, device=device)
@@ -51,38 +51,38 @@ class OnDevice:
             for name, array in first.arrays().items()
         }
         self._sources = torch.zeros(len(rings) * self._capacity, dtype=torch.int64, device=device)
-        # Of each ring: its first step that can be sampled, its steps so far, and its newest moment,
-        # counted from the one that lies in its first slot.
+        # For each ring: its first step that can be sampled, its steps so far, and its newest
+        # timestep, counted from the one in its first slot.
         self._counts = torch.zeros((len(rings), 3), dtype=torch.int64, device=device)
         self._told = torch.zeros_like(self._counts, device="cpu")
-        self._there = [(0, 0)] * len(rings)  # moments and steps that were brought over
+        self._there = [(0, 0)] * len(rings)  # timesteps and steps that were brought over
         self._sampler = Sampler(self._fields, first.config)
 
     def follow(self) -> None:
         """Bring over what the rings have taken in since the last time."""
         counts = torch.tensor(
             [
-                (*counts, moments - ring.places.origin)
+                (*counts, timesteps - ring.ring_index.origin)
                 for ring in self._rings
-                for *counts, moments in [ring.counts()]
+                for *counts, timesteps in [ring.counts()]
             ]
         )
         if torch.equal(counts, self._told):
             return
         self._told = counts
-        for index, (ring, (_, steps, moments)) in enumerate(
+        for index, (ring, (_, steps, timesteps)) in enumerate(
             zip(self._rings, counts.tolist(), strict=True)
         ):
-            had_moments, had_steps = self._there[index]
+            had_timesteps, had_steps = self._there[index]
             arrays = {name: torch.from_numpy(array) for name, array in ring.arrays().items()}
-            for part in _parts(had_moments, moments, ring.places.length):
+            for part in _parts(had_timesteps, timesteps, ring.ring_index.length):
                 at = self._first_slots[index] + part.start
                 for name, array in arrays.items():
                     self._bring(array[part], self._fields[name], at)
             for part in _parts(had_steps, steps, self._capacity):
-                sources = torch.from_numpy(ring.sources[part] - ring.places.origin)
+                sources = torch.from_numpy(ring.sources[part] - ring.ring_index.origin)
                 self._bring(sources, self._sources, index * self._capacity + part.start)
-            self._there[index] = (moments, steps)
+            self._there[index] = (timesteps, steps)
         self._bring(counts, self._counts, 0)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
@@ -108,12 +108,12 @@ class OnDevice:
         """The samples that start at these steps of these rings, each int64 (B,)."""
         source = self._sources[ring * self._capacity + step % self._capacity]
         newest = self._counts[ring, 2]
-        picks = self._sampler.pick(source, newest, self._bases[ring], self._slots[ring])
+        indices = self._sampler.pick(source, newest, self._bases[ring], self._slots[ring])
         now, then = (
             {key: self._sampler.observed(name, slots) for key, name in self._keys.items()}
-            for slots in (picks.now, picks.then)
+            for slots in (indices.now, indices.then)
         )
-        return Batch(now, self._sampler.action(picks), picks.reward, picks.discount, then)
+        return Batch(now, self._sampler.action(indices), indices.reward, indices.discount, then)
 
     def _bring(self, part: Tensor, whole: Tensor, at: int) -> None:
         """Copy rows over. From pinned memory the host does not wait for the card."""

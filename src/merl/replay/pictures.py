@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.core import Copy
+from merl.core import FrameTransform
 
 
 class Pictures(Protocol):
@@ -67,7 +67,7 @@ def as_it_is(_: int, frames: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
     out[:] = frames
 
 
-def copied(pictures: Pictures, slots: NDArray[np.int64], copy: Copy) -> NDArray[np.uint8]:
+def copied(pictures: Pictures, slots: NDArray[np.int64], copy: FrameTransform) -> NDArray[np.uint8]:
     """Pictures at slots (B, K), each stack copied as it is told: (B, K, H, W, C)."""
     out = np.empty((*slots.shape, *pictures.shape), np.uint8)
     for sample, (frames, place) in enumerate(zip(pictures.stacks(slots), out, strict=True)):

@@ -1,15 +1,15 @@
-"""The ring: slots, moments and steps; stacks and n-step returns are made when sampled.
+"""The ring: slots, timesteps and steps; stacks and n-step returns are made when sampled.
 
-One slot holds one *moment*: what was seen, and the action, reward and discount that led there. An
-episode of T steps is T + 1 moments in a row, the first of which was led to by nothing. Moments are
-numbered 1, 2, 3, ... as they come; moment i is entry i - 1 of the slots (`places.py`).
+One slot holds one *timestep*: an observation, and the action, reward and discount that led to it.
+An episode of T steps takes T + 1 timesteps in a row; no action led to the first of them. Timesteps
+are numbered 1, 2, 3, ...; timestep i is entry i - 1 of the slots (`ring_index.py`).
 
-    moment        7      8      9     10     11     12
+    timestep        7      8      9     10     11     12
     position      0      1      2      3      0      1      in its episode; 0 begins one
     step              *      *      *             *         o_t -> o_{t+1}, what is sampled
 
 A process that is killed loses nothing that was written. A machine that loses power loses what came
-after the last `flush`, and where that had begun to overwrite old moments, those may be torn. A
+after the last `flush`, and where that had begun to overwrite old timesteps, those may be torn. A
 checkpoint calls `flush`, keeps `state_dict`, and calls `settle` once it is on the disk: what is
 overwritten from then on goes into a journal, from which `load_state_dict` puts it back.
 """
@@ -27,12 +27,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from merl.core import Batch, Copies, MerlError, Observation, Transition, is_image
+from merl.core import Batch, FrameTransforms, MerlError, Observation, Transition, is_image
 from merl.replay.compression import CompressedPictures
 from merl.replay.config import ReplayConfig, check_fits, slots_for
 from merl.replay.journal import Journal
 from merl.replay.pictures import Pictures, RawPictures, ReadAhead, as_it_is, copied
-from merl.replay.sampling import Picks, Sampler
+from merl.replay.sampling import SampleIndices, Sampler
 from merl.replay.storage import (
     Layout,
     check_value,
@@ -45,7 +45,7 @@ from merl.replay.storage import (
 _LOG = logging.getLogger(__name__)
 
 
-class Replay:
+class EpisodeRing:
     """The steps that were taken, and batches of them for the learner.
 
     Every step that is held is sampled with the same probability, those of the episode in progress
@@ -56,9 +56,9 @@ class Replay:
     Attributes:
         config: what is kept and how it is sampled.
         capacity: steps that are kept.
-        places: where the moments lie; a moment's entry is its number less one.
+        places: where the timesteps lie; a timestep's entry is its number less one.
         keys: the field that each of an observation's keys is kept in.
-        sources: step i led away from moment sources[i mod capacity].
+        sources: step i led away from timestep sources[i mod capacity].
     """
 
     def __init__(
@@ -128,24 +128,24 @@ class Replay:
         self._journal: Journal | None = None
         if directory is not None:
             self._journal = Journal(directory, self._data, layout.slots, self._compressed)
-        self.places = layout.slots
+        self.ring_index = layout.slots
         fields_there = {name: torch.from_numpy(array) for name, array in arrays.items()}
         self._sampler = Sampler(fields_there, config)
-        self._moments = self._steps = 0  # ever written
+        self._timesteps = self._steps = 0  # ever written
         self._first = 0  # the oldest step that can be sampled
-        self._oldest = 1  # the oldest moment that is held
+        self._oldest = 1  # the oldest timestep that is held
         self._open = False  # an episode is in progress
-        self._settled = 0  # the newest moment of the last checkpoint
+        self._settled = 0  # the newest timestep of the last checkpoint
         self._told = False  # that fewer steps are held than asked for
         self.sources = np.zeros(self.capacity, np.int64)
-        self._take_over(moments=int(self._data["moment"].max()))
+        self._take_over(timesteps=int(self._data["timestep"].max()))
 
     def __len__(self) -> int:
         """Steps that can be sampled now."""
         return self._steps - self._first
 
     def begin(self, observation: Observation) -> None:
-        """The first moment of an episode; one still in progress is cut off.
+        """The first timestep of an episode; one still in progress is cut off.
 
         Raises:
             MerlError: the observation does not fit the space.
@@ -170,7 +170,7 @@ class Replay:
                 f"discount {transition.discount} with last={transition.last}: it is 0 at a true "
                 "end, which is last, and 1 everywhere else"
             )
-        source = self._moments
+        source = self._timesteps
         self._write(
             transition.observation,
             position=int(self._data["position"][self._slot(source)]) + 1,
@@ -187,8 +187,8 @@ class Replay:
         self,
         batch_size: int,
         rng: np.random.Generator,
-        now: Copies | None = None,
-        then: Copies | None = None,
+        now: FrameTransforms | None = None,
+        then: FrameTransforms | None = None,
     ) -> Batch:
         """Draw steps uniformly, with replacement.
 
@@ -209,21 +209,21 @@ class Replay:
         if not len(self):
             raise ValueError("the replay is empty: add a step before sampling")
         steps = rng.integers(self._first, self._steps, size=batch_size)
-        picks = self._sampler.pick(
-            torch.from_numpy(self.sources[steps % self.capacity] - self.places.origin),
-            newest=torch.tensor([self._moments - self.places.origin]),
+        indices = self._sampler.pick(
+            torch.from_numpy(self.sources[steps % self.capacity] - self.ring_index.origin),
+            newest=torch.tensor([self._timesteps - self.ring_index.origin]),
             base=torch.tensor([0]),
-            slots=torch.tensor([self.places.length]),
+            slots=torch.tensor([self.ring_index.length]),
         )
         self._ahead.begin()
         if self._files and self._ahead.is_wanted:
-            self._read_ahead(picks)
+            self._read_ahead(indices)
         batch = Batch(
-            observation=self._observation(picks.now, now or {}),
-            action=self._sampler.action(picks),
-            reward=picks.reward,
-            discount=picks.discount,
-            next_observation=self._observation(picks.then, then or {}),
+            observation=self._observation(indices.now, now or {}),
+            action=self._sampler.action(indices),
+            reward=indices.reward,
+            discount=indices.discount,
+            next_observation=self._observation(indices.then, then or {}),
         )
         self._ahead.end()
         return batch
@@ -238,8 +238,8 @@ class Replay:
         return self._data
 
     def counts(self) -> tuple[int, int, int]:
-        """The first step that can be sampled, how many steps there were, the newest moment."""
-        return self._first, self._steps, self._moments
+        """The first step that can be sampled, how many steps there were, the newest timestep."""
+        return self._first, self._steps, self._timesteps
 
     def flush(self) -> None:
         """Have everything written reach the disk; returns when it has."""
@@ -248,14 +248,14 @@ class Replay:
 
     def settle(self) -> None:
         """A checkpoint of the present state is on the disk: no older one is to be gone back to."""
-        self._settled = self._moments
+        self._settled = self._timesteps
         if self._journal is not None:
             self._journal.empty()
 
     def state_dict(self) -> dict[str, Any]:
-        """The cursor and its counts as plain numbers; the moments stay where they are."""
+        """The cursor and its counts as plain numbers; the timesteps stay where they are."""
         return {
-            "moments": self._moments,
+            "timesteps": self._timesteps,
             "steps": self._steps,
             "open": self._open,
             "starts": {n: pictures.backgrounds.starts for n, pictures in self._compressed.items()},
@@ -265,18 +265,18 @@ class Replay:
         """Go back to what `state_dict` said; what was written since then is forgotten.
 
         What was overwritten since then is put back, if that was the last state to be settled. If
-        the moment of the state itself is overwritten and cannot be put back (the disk was full, or
-        the state is an older one), the ring stays as it is, which is a warning: the steps that it
-        holds are the run's as well.
+        the timestep of the state itself is overwritten and cannot be put back (the disk was full,
+        or the state is an older one), the ring stays as it is, with a warning: the steps that it
+        holds are of the same run.
 
         Raises:
             MerlError: the ring does not hold what the state names, and nothing newer.
         """
-        moments = int(state["moments"])
+        timesteps = int(state["timesteps"])
         journal = self._journal
-        there = moments == 0 or self._data["moment"][self._slot(moments)] == moments
-        if not there and (journal is None or not journal.holds(moments)):
-            if self._moments > moments:
+        there = timesteps == 0 or self._data["timestep"][self._slot(timesteps)] == timesteps
+        if not there and (journal is None or not journal.holds(timesteps)):
+            if self._timesteps > timesteps:
                 _LOG.warning(
                     "the replay has overwritten what it held at the checkpoint, and keeps the %s "
                     "newer steps that it has: training continues, but not bit for bit as before",
@@ -284,23 +284,23 @@ class Replay:
                 )
                 if journal is not None:
                     journal.empty()
-                self._take_over(self._moments)
+                self._take_over(self._timesteps)
                 self._settled = 0
                 return
             raise MerlError(
-                f"the replay does not hold moment {moments:,}, at which the checkpoint was taken: "
-                "it is not this run's; start a new run"
+                f"the replay does not hold timestep {timesteps:,}, at which the checkpoint was "
+                "taken: it belongs to another run; start a new run"
             )
         for name, starts in state.get("starts", {}).items():
             self._compressed[name].backgrounds.go_back(int(starts))
         if journal is not None:
-            journal.undo(moments)
-        self._take_over(moments, int(state["steps"]), bool(state["open"]))
-        self._settled = moments
+            journal.undo(timesteps)
+        self._take_over(timesteps, int(state["steps"]), bool(state["open"]))
+        self._settled = timesteps
 
-    def _slot(self, moment: int) -> int:
-        """Where the ring holds a moment."""
-        return self.places.of(moment - 1)
+    def _slot(self, timestep: int) -> int:
+        """Where the ring holds a timestep."""
+        return self.ring_index.of(timestep - 1)
 
     def _write(
         self,
@@ -311,17 +311,17 @@ class Replay:
         reward: float,
         discount: float,
     ) -> None:
-        """Write the next moment; all is checked before anything is changed."""
+        """Write the next timestep; all is checked before anything is changed."""
         data = self._data
         values = {name: observation.get(key) for key, name in self.keys.items()}
         values["action"] = np.zeros_like(data["action"][0]) if action is None else action
         for name, value in values.items():
             field = self._values[name]
             check_value(name, value, field.dtype, field.shape)
-        moment = self._moments + 1
-        slot = self._slot(moment)
+        timestep = self._timesteps + 1
+        slot = self._slot(timestep)
         kept = {n: p.encode(np.asarray(values.pop(n))) for n, p in self._compressed.items()}
-        self._make_room(moment, kept)
+        self._make_room(timestep, kept)
         for name, value in values.items():
             data[name][slot] = value
         for name, picture in kept.items():
@@ -329,23 +329,23 @@ class Replay:
         data["position"][slot] = position
         data["reward"][slot] = reward
         data["discount"][slot] = discount
-        data["moment"][slot] = moment
-        self._moments = moment
+        data["timestep"][slot] = timestep
+        self._timesteps = timestep
         self._forget()
 
-    def _make_room(self, moment: int, kept: Mapping[str, bytes]) -> None:
-        """Let go of the oldest moments, as many as moment number `moment` will overwrite."""
+    def _make_room(self, timestep: int, kept: Mapping[str, bytes]) -> None:
+        """Let go of the oldest timesteps, as many as timestep number `timestep` will overwrite."""
         ends = {name: self._compressed[name].end_of(picture) for name, picture in kept.items()}
-        while self._oldest < moment:
+        while self._oldest < timestep:
             slot = self._slot(self._oldest)
-            if self._oldest > moment - self.places.length:
+            if self._oldest > timestep - self.ring_index.length:
                 if not any(self._compressed[n].overwritten(slot, end) for n, end in ends.items()):
                     break
                 self._tell_of_less()
             if self._journal is not None and self._oldest <= self._settled:
-                self._journal.keep(slot, by=moment)
-            # From here on it is no moment, should the process die while it is overwritten.
-            self._data["moment"][slot] = 0
+                self._journal.keep(slot, by=timestep)
+            # From here on it is no timestep, should the process die while it is overwritten.
+            self._data["timestep"][slot] = 0
             self._oldest += 1
 
     def _tell_of_less(self) -> None:
@@ -369,42 +369,44 @@ class Replay:
                 break
             self._first += 1
 
-    def _take_over(self, moments: int, steps: int | None = None, in_progress: bool = False) -> None:
-        """Go on after moment number `moments`: find the steps that the ring holds up to there.
+    def _take_over(
+        self, timesteps: int, steps: int | None = None, in_progress: bool = False
+    ) -> None:
+        """Go on after timestep number `timesteps`: find the steps that the ring holds up to there.
 
         Args:
-            moments: moments ever written.
+            timesteps: timesteps ever written.
             steps: steps ever taken; unknown, they are counted from the oldest that is held.
-            in_progress: the episode that the last moment belongs to goes on.
+            in_progress: the episode that the last timestep belongs to goes on.
         """
-        stamps = self._data["moment"]
-        stamps[stamps > moments] = 0  # else they would pass for what follows, if opened once more
-        numbers = np.arange(max(0, moments - self.places.length) + 1, moments + 1)
-        slots = self.places.of(numbers - 1)
+        stamps = self._data["timestep"]
+        stamps[stamps > timesteps] = 0  # else they would pass for what follows, if opened once more
+        numbers = np.arange(max(0, timesteps - self.ring_index.length) + 1, timesteps + 1)
+        slots = self.ring_index.of(numbers - 1)
         missing = numbers[stamps[slots] != numbers]  # overwritten since, or only half written
-        self._oldest = int(missing[-1] if missing.size else moments - len(numbers)) + 1
+        self._oldest = int(missing[-1] if missing.size else timesteps - len(numbers)) + 1
         for pictures in self._compressed.values():
-            pictures.go_on_after(self._slot(moments) if moments else None)
+            pictures.go_on_after(self._slot(timesteps) if timesteps else None)
         leads = (numbers[:-1] >= self._oldest) & (self._data["position"][slots[1:]] > 0)
         sources = numbers[:-1][leads][-self.capacity :]
-        self._moments, self._open = moments, in_progress
+        self._timesteps, self._open = timesteps, in_progress
         self._steps = len(sources) if steps is None else steps
         self._first = self._steps - len(sources)
         self.sources[np.arange(self._steps - len(sources), self._steps) % self.capacity] = sources
         self._forget()
 
-    def _read_ahead(self, picks: Picks) -> None:
+    def _read_ahead(self, indices: SampleIndices) -> None:
         """Ask for the pictures of a batch: a sample's lie in one piece but for where the ring ends.
 
         They are on the disk alone after a resumption, and wherever others use the memory.
         """
-        now, then = picks.now.numpy(), picks.then.numpy()
+        now, then = indices.now.numpy(), indices.then.numpy()
         near = self.config.n_step <= self.config.frame_stack  # o_t and o_{t+n} touch
         for first, last in [(now, then)] if near else [(now, now), (then, then)]:
             for name, pictures in self._images.items():
                 self._ahead.ask(self._files[name], *pictures.stretch(first[:, 0], last[:, -1]))
 
-    def _observation(self, slots: torch.Tensor, copies: Copies) -> dict[str, torch.Tensor]:
+    def _observation(self, slots: torch.Tensor, copies: FrameTransforms) -> dict[str, torch.Tensor]:
         """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""
         return {
             key: torch.from_numpy(

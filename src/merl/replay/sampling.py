@@ -16,13 +16,13 @@ from merl.replay.config import ReplayConfig
 
 
 @dataclass(frozen=True)
-class Picks:
+class SampleIndices:
     """Where B sampled steps lie in the ring, and what they paid.
 
     Attributes:
         now: slots of o_t's frames, oldest first, int64 (B, K).
         then: slots of o_{t+m}'s, likewise.
-        action: slot of the moment that a_t led to, int64 (B,).
+        action: slot of the timestep that a_t led to, int64 (B,).
         reward: sum of gamma^i r_{t+i} for i < m, float32 (B,).
         discount: gamma^m, or 0 at a true end, float32 (B,).
     """
@@ -50,33 +50,33 @@ class Sampler:
         powers = [config.discount**power for power in range(config.n_step + 1)]
         self._powers = torch.tensor(powers, dtype=torch.float64, device=device)
 
-    def pick(self, source: Tensor, newest: Tensor, base: Tensor, slots: Tensor) -> Picks:
-        """Lay out the samples that start at moments `source`.
+    def pick(self, source: Tensor, newest: Tensor, base: Tensor, slots: Tensor) -> SampleIndices:
+        """Lay out the samples that start at timesteps `source`.
 
         Args:
-            source: numbers of moments, int64 (B,), where number 1 lies in the first slot.
-            newest: the newest moment of their ring, int64 (B,) or (1,).
+            source: numbers of timesteps, int64 (B,), where number 1 lies in the first slot.
+            newest: the newest timestep of their ring, int64 (B,) or (1,).
             base: the first slot of their ring, likewise.
             slots: of their ring, likewise.
         """
-        fields, newest, moments = self._fields, newest[:, None], source[:, None]
+        fields, newest, timesteps = self._fields, newest[:, None], source[:, None]
         base, length = base[:, None], slots[:, None]
 
-        def slot(moment: Tensor) -> Tensor:
-            return (moment - 1) % length + base
+        def slot(timestep: Tensor) -> Tensor:
+            return (timestep - 1) % length + base
 
-        begun = moments - fields["position"][slot(moments)]  # the episode's first
-        ahead = moments + 1 + self._ahead  # (B, n): what r_t, r_{t+1}, ... led to
+        begun = timesteps - fields["position"][slot(timesteps)]  # the episode's first
+        ahead = timesteps + 1 + self._ahead  # (B, n): what r_t, r_{t+1}, ... led to
         led_to = slot(ahead)
         same = ((ahead <= newest) & (fields["position"][led_to] > 0)).long().cumprod(dim=1)
         steps = same.sum(dim=1)  # (B,): m
-        end = moments + steps[:, None]
-        # Slots beyond the newest moment may never have been written: no number times 0 is none.
+        end = timesteps + steps[:, None]
+        # Slots beyond the newest timestep may never have been written: no number times 0 is none.
         paid = torch.where(same.bool(), fields["reward"][led_to], 0.0)
         rewards = paid * self._powers[:-1]  # float64
         last = fields["discount"][slot(end)[:, 0]]
-        return Picks(
-            now=slot(torch.maximum(moments - self._back, begun)),
+        return SampleIndices(
+            now=slot(torch.maximum(timesteps - self._back, begun)),
             then=slot(torch.maximum(end - self._back, begun)),
             action=led_to[:, 0],
             reward=rewards.sum(dim=1).float(),
@@ -92,6 +92,6 @@ class Sampler:
             return torch.from_numpy(field.numpy().take(slots.numpy(), axis=0))
         return field.index_select(0, slots.flatten()).view(*slots.shape, *field.shape[1:])
 
-    def action(self, picks: Picks) -> Tensor:
+    def action(self, indices: SampleIndices) -> Tensor:
         """a_t, float32 (B, A)."""
-        return self._fields["action"].index_select(0, picks.action)
+        return self._fields["action"].index_select(0, indices.action)

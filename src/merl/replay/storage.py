@@ -4,7 +4,7 @@
 types, shapes and the number of slots; it is written last, so a directory that has it is whole. An
 observation's key is quoted as in a URL: `observation.image.bin`, `observation.arm%2Fjoints.bin`.
 Compressed pictures lie behind one another in theirs, `observation.image.span.bin` says where
-(`compression.py`). Which slot, or which byte, the ring begins with is an origin (`places.py`).
+(`compression.py`). Which slot, or which byte, the ring begins with is an origin (`ring_index.py`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 from merl.core import MerlError, is_image, is_vector
 from merl.core.resources import reserve_file
 from merl.replay.compression import reserved_bytes
-from merl.replay.places import Move, Places
+from merl.replay.ring_index import Move, RingIndex
 
 _FORMAT = 1
 _HEADER = "replay.json"
@@ -50,12 +50,12 @@ class Layout:
     """Where everything lies.
 
     Attributes:
-        slots: of the ring; a moment's entry is its number less one.
+        slots: of the ring; a timestep's entry is its number less one.
         bytes: of compressed pictures, by field.
     """
 
-    slots: Places
-    bytes: Mapping[str, Places]
+    slots: RingIndex
+    bytes: Mapping[str, RingIndex]
 
     @classmethod
     def of(
@@ -69,8 +69,11 @@ class Layout:
         origins = byte_origins or {}
         compressed = [name for name in fields if f"{name}.span" in fields]
         return cls(
-            Places(slots, origin),
-            {name: Places(slots * fields[name].bytes, origins.get(name, 0)) for name in compressed},
+            RingIndex(slots, origin),
+            {
+                name: RingIndex(slots * fields[name].bytes, origins.get(name, 0))
+                for name in compressed
+            },
         )
 
 
@@ -103,7 +106,7 @@ def fields_of(
     fields["reward"] = Field(np.dtype("<f4"), ())
     fields["discount"] = Field(np.dtype("<f4"), ())
     fields["position"] = Field(np.dtype("<i4"), ())
-    fields["moment"] = Field(np.dtype("<i8"), ())  # its number; 0 while there is none
+    fields["timestep"] = Field(np.dtype("<i8"), ())  # its number; 0 while there is none
     return fields
 
 
@@ -181,16 +184,16 @@ def _lengthened(
     held = layout.slots.length
     if slots <= held:
         return layout, {}
-    moments = int(np.fromfile(directory / "moment.bin", "<i8", held).max(initial=0))
+    timesteps = int(np.fromfile(directory / "timestep.bin", "<i8", held).max(initial=0))
     ends = {}  # of the compressed pictures
     for name in layout.bytes:
         spans = np.fromfile(directory / f"{name}.span.bin", "<i8", 2 * held).reshape(-1, 2)
-        ends[name] = int(spans[layout.slots.of(moments - 1)].sum()) if moments else 0
-    least = [layout.slots.least_longer(moments)]
-    for name, places in layout.bytes.items():
-        least.append(-(-places.least_longer(ends[name]) // fields[name].bytes))
+        ends[name] = int(spans[layout.slots.of(timesteps - 1)].sum()) if timesteps else 0
+    least = [layout.slots.least_longer(timesteps)]
+    for name, ring_index in layout.bytes.items():
+        least.append(-(-ring_index.least_longer(ends[name]) // fields[name].bytes))
     slots = max(slots, *least)
-    places, move = layout.slots.longer(slots, moments)
+    ring_index, move = layout.slots.longer(slots, timesteps)
     moves, of_bytes = {}, {}
     for name, field in fields.items():
         if name not in layout.bytes:
@@ -200,7 +203,7 @@ def _lengthened(
         of_bytes[name], its = layout.bytes[name].longer(slots * field.bytes, ends[name])
         if its is not None:
             moves[name] = its
-    return Layout(places, of_bytes), moves
+    return Layout(ring_index, of_bytes), moves
 
 
 def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:
@@ -262,7 +265,7 @@ def _header_text(fields: dict[str, Field], layout: Layout, capacity: int) -> str
         "capacity": capacity,
         "slots": layout.slots.length,
         "origin": layout.slots.origin,
-        "byte_origins": {name: places.origin for name, places in layout.bytes.items()},
+        "byte_origins": {name: ring_index.origin for name, ring_index in layout.bytes.items()},
         "fields": _described(fields),
     }
     return json.dumps(header, indent=2) + "\n"

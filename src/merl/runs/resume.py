@@ -71,7 +71,7 @@ def decided(config: TrainConfig) -> TrainConfig:
     return config
 
 
-def taken_up(
+def merge_resume_config(
     recorded: TrainConfig, asked: TrainConfig, given_open: Iterable[str] = ()
 ) -> tuple[TrainConfig, list[str]]:
     """The config with which a run goes on.

@@ -31,8 +31,8 @@ from merl.agents.networks import modalities
 from merl.config import TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
 from merl.envs.config import AUTO_RENDERER, check_not_removed
-from merl.envs.own import imports_code, load_module, module_folder
 from merl.envs.registration import ENV_IDS
+from merl.envs.user_env import imports_code, load_module, module_folder
 from merl.runs import trust
 from merl.runs.plain import box, describe, from_plain, to_plain, told
 from merl.runs.provenance import commit, machine, package_versions
@@ -249,7 +249,7 @@ class Run:
             return False
         metrics = self.path / METRICS_FILE
         has_rows = metrics.exists() and metrics.read_bytes().count(b"\n") > 1
-        if has_rows or any(np.fromfile(f, "<i8").any() for f in self.replay.rglob("moment.bin")):
+        if has_rows or any(np.fromfile(f, "<i8").any() for f in self.replay.rglob("timestep.bin")):
             return False
         for folder in (self.replay, self.checkpoints):
             shutil.rmtree(folder, ignore_errors=True)

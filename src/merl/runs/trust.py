@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from merl.core import MerlError
-from merl.envs.own import imports_code
+from merl.envs.user_env import imports_code
 
 _LOG = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from merl.core import MerlError, meant
+from merl.core import MerlError, suggest
 from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
 
 # isort: split
@@ -54,7 +54,7 @@ def make_task(
         MerlError: there is no such task, or it has no such form.
     """
     if name not in TASKS:
-        raise MerlError(f"task {name!r} is unknown: {meant(name, TASKS)}")
+        raise MerlError(f"task {name!r} is unknown: {suggest(name, TASKS)}")
     if name in BOX_TASKS:
         if occluded and starts != ABOVE:
             raise MerlError(

@@ -19,7 +19,7 @@ from rich.text import Text
 from merl.core import METRICS_FILE, counted
 from merl.evaluation.evaluation import Evaluation
 from merl.runs.run import Run
-from merl.training.loop import Moment
+from merl.training.loop import StepResult
 
 RECENT = 10
 """Training episodes over which the shown means are taken."""
@@ -82,7 +82,7 @@ class ConsoleView:
         elif self._scale:
             self._print(f"returns to compare with: {self._compared()}")
 
-    def moment(self, moment: Moment, metrics: dict[str, float]) -> None:
+    def moment(self, moment: StepResult, metrics: dict[str, float]) -> None:
         """Show an environment step; `metrics` is empty unless an episode ended."""
         self._step = moment.step
         if self._learning_since is None and moment.updates:

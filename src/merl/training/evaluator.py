@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from merl.core import EvaluationFailed, MerlError
 from merl.core.signals import Interrupt
-from merl.envs.adapted import in_one_line
+from merl.envs.wrappers import in_one_line
 from merl.evaluation.evaluation import Evaluation, Policy, evaluate
 from merl.runs.metrics import MetricsWriter
 from merl.runs.run import Run

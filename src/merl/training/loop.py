@@ -17,12 +17,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from merl.acting.environments import Environments, Lost
+from merl.acting.environments import Environments, WorkerDied
 from merl.acting.rollout import Episode, Fetched, FrameStack, side_by_side
 from merl.config import TrainConfig
 from merl.core import Agent, Transition
-from merl.core.guards import check_moment
-from merl.replay import Lanes
+from merl.core.guards import check_finite
+from merl.replay import ReplayBuffer
 
 
 @dataclass
@@ -39,7 +39,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Moment:
+class StepResult:
     """What the loop tells after an environment step, or one step of each of several environments.
 
     A run that goes on where updates were left begins with one that tells of those alone.
@@ -110,14 +110,14 @@ class Randomness:
 
 
 def train(
-    stage: Stage,
+    stage: Collector,
     agent: Agent,
     update: Update,
     progress: Progress,
     randomness: Randomness,
     config: TrainConfig,
     is_to_stop: Callable[[], bool] = lambda: False,
-) -> Iterator[Moment]:
+) -> Iterator[StepResult]:
     """Act and learn until `config.steps`; yields after each step of the environments.
 
     Args:
@@ -142,7 +142,7 @@ def train(
     agent.step = max(0, progress.step - config.action_repeat * stage.count)
     left = learn() if config.synchronous else {}
     if left or stopping():
-        yield Moment(progress.step, progress.updates, left)
+        yield StepResult(progress.step, progress.updates, left)
     while progress.step < config.steps:
         agent.step = progress.step
         learning: dict[str, Tensor] = {}
@@ -158,29 +158,31 @@ def train(
             if not (told or config.synchronous):
                 learning = learn()
             ended = stage.remember(progress, config.action_repeat)
-        except Lost as lost:
+        except WorkerDied as lost:
             stage.broken = True
-            yield Moment(progress.step, progress.updates, learning, lost=str(lost))
+            yield StepResult(progress.step, progress.updates, learning, lost=str(lost))
             continue
         if config.synchronous or progress.step >= config.steps:
             learning = learn() or learning
         progress.episodes += len(ended)
-        yield Moment(progress.step, progress.updates, learning, ended)
+        yield StepResult(progress.step, progress.updates, learning, ended)
 
 
-class Stage:
+class Collector:
     """The environments that the agent acts in, with the stacks that it sees, and the replay.
 
     Args:
         environments: one or several.
-        replay: a lane for each.
+        replay: a ring for each.
         stacks: of each one's frames.
 
     Attributes:
         broken: an environment's process was lost; all are made anew before the next episode.
     """
 
-    def __init__(self, environments: Environments, replay: Lanes, stacks: list[FrameStack]) -> None:
+    def __init__(
+        self, environments: Environments, replay: ReplayBuffer, stacks: list[FrameStack]
+    ) -> None:
         self.environments, self.replay, self.stacks = environments, replay, stacks
         self.broken = False
         self._seeds: dict[int, int] = {}
@@ -214,8 +216,8 @@ class Stage:
         if not starting:
             return
         for index, observation in self.environments.reset(starting).items():
-            check_moment(observation, 0.0, progress.step, self._where(index))
-            self.replay.lanes[index].begin(observation)
+            check_finite(observation, 0.0, progress.step, self._where(index))
+            self.replay.rings[index].begin(observation)
             self.stacks[index].reset(observation)
             self._episodes[index] = Episode()
 
@@ -230,10 +232,10 @@ class Stage:
         ended = []
         for index, step in enumerate(self.environments.receive()):
             reached = progress.step + repeat
-            check_moment(step.observation, step.reward, reached, self._where(index))
+            check_finite(step.observation, step.reward, reached, self._where(index))
             over = bool(step.terminated or step.truncated)
             discount = 0.0 if step.terminated else 1.0
-            self.replay.lanes[index].add(
+            self.replay.rings[index].add(
                 Transition(self._actions[index], step.reward, discount, step.observation, over)
             )
             self.stacks[index].push(step.observation)
@@ -249,7 +251,7 @@ class Stage:
 
 
 def _actions(
-    stage: Stage, agent: Agent, progress: Progress, randomness: Randomness, config: TrainConfig
+    stage: Collector, agent: Agent, progress: Progress, randomness: Randomness, config: TrainConfig
 ) -> Fetched:
     """Uniformly random at first, then the agent's: (count, A) in [-1, 1]."""
     if progress.step < config.random_steps:

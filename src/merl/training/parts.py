@@ -23,7 +23,7 @@ from merl.agents.networks import make_networks
 from merl.config import TrainConfig
 from merl.core import MerlError, counted
 from merl.core.resources import available_memory, keep_freed_memory
-from merl.envs.own import load_module
+from merl.envs.user_env import load_module
 from merl.evaluation.video import MIN_SIDE
 from merl.replay import check_fits
 from merl.runs.resume import left_open
@@ -126,7 +126,7 @@ class Parts:
                     actions,
                     directory=run_path(config, home),
                     capacity=config.capacity,
-                    lanes=config.num_envs,
+                    rings=config.num_envs,
                 )
             eval_env = None
             if config.eval.every:

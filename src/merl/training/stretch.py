@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from merl.acting.environments import Environments, Lost
+from merl.acting.environments import Environments, WorkerDied
 from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.core import (
     EnvironmentFailed,
@@ -23,7 +23,7 @@ from merl.core import (
 from merl.core.guards import LossGuard
 from merl.core.signals import Interrupt
 from merl.evaluation.evaluation import Evaluation
-from merl.replay import Lanes
+from merl.replay import ReplayBuffer
 from merl.runs import checkpoint
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.metrics import MetricsWriter
@@ -31,7 +31,7 @@ from merl.runs.plain import to_plain
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
 from merl.training.evaluator import Evaluations
-from merl.training.loop import Moment, Progress, Stage, train
+from merl.training.loop import Collector, Progress, StepResult, train
 from merl.training.meters import Averages, Clock, Interval
 from merl.training.parts import Parts
 from merl.training.updating import make_update
@@ -47,7 +47,7 @@ class View(Protocol):
     def begin(self, run: Run, step: int) -> None:
         """Training begins, or goes on from there."""
 
-    def moment(self, moment: Moment, metrics: dict[str, float]) -> None:
+    def moment(self, moment: StepResult, metrics: dict[str, float]) -> None:
         """A step was taken; `metrics` is empty unless an episode ended."""
 
     def evaluating(self, episode: int, total: int) -> None:
@@ -91,7 +91,7 @@ class Stretch:
         self,
         parts: Parts,
         run: Run,
-        replay: Lanes,
+        replay: ReplayBuffer,
         environments: Environments,
         metrics: MetricsWriter,
         view: View,
@@ -150,7 +150,7 @@ class Stretch:
             FrameStack(self.config.replay.frame_stack, images, parts.device)
             for _ in range(self.environments.count)
         ]
-        stage = Stage(self.environments, self.replay, stacks)
+        stage = Collector(self.environments, self.replay, stacks)
         update = make_update(
             parts.agent,
             self.replay,
@@ -236,13 +236,13 @@ class Stretch:
                 self._states = states if isinstance(states, list) else [states]
                 self.environments.restore(self._states)
                 self.clock = Clock(float(state["seconds"]), float(state["cpu_seconds"]))
-        except Lost as lost:
+        except WorkerDied as lost:
             raise EnvironmentsLost(
                 f"an environment's process {lost} right after its start: see what it said above"
             ) from None
         self.metrics.trim(parts.progress.step)
 
-    def _watch_for_episode_end(self, moment: Moment) -> None:
+    def _watch_for_episode_end(self, moment: StepResult) -> None:
         """Warn, once, if no episode ends: metrics and evaluations wait for that."""
         long = min(LONG * self.environments.count, max(1, self.config.steps // 2))
         if moment.episodes:
@@ -289,7 +289,7 @@ class Stretch:
         elif self._interval.is_due():
             self._save()
 
-    def _log(self, moment: Moment) -> dict[str, float]:
+    def _log(self, moment: StepResult) -> dict[str, float]:
         """A row of metrics for the episode that has ended."""
         self.guard.check()
         self.run.check_there()
@@ -311,7 +311,7 @@ class Stretch:
 
     def _environment_states(self) -> Sequence[Mapping[str, Any] | None]:
         """Return the states of the environments; of those that are lost, the last known."""
-        with suppress(Lost):
+        with suppress(WorkerDied):
             self._states = self.environments.states()
         return self._states
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from contextlib import ExitStack
 
-from merl.acting.environments import Here, Workers
+from merl.acting.environments import InProcessEnvs, WorkerEnvs
 from merl.acting.run_env import own_bounds
 from merl.core.signals import Interrupt
 from merl.networks.settings import torch_settings
-from merl.replay import Lanes
+from merl.replay import ReplayBuffer
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.metrics import MetricsWriter
 from merl.runs.run import Run
@@ -44,7 +44,7 @@ def _train(parts: Parts, run: Run, point: Checkpoint | None, view: View) -> Outc
         interrupt = stack.enter_context(Interrupt().listening())
         metrics = stack.enter_context(MetricsWriter(run.path, view.warn))
         with torch_settings(parts.device):
-            replay = Lanes(
+            replay = ReplayBuffer(
                 config.replay,
                 parts.space,
                 parts.action_space,
@@ -53,7 +53,9 @@ def _train(parts: Parts, run: Run, point: Checkpoint | None, view: View) -> Outc
                 capacity=config.capacity,
             )
         with interrupt.raising():
-            environments = Workers(config, parts.env) if config.has_workers else Here(parts.env)
+            environments = (
+                WorkerEnvs(config, parts.env) if config.has_workers else InProcessEnvs(parts.env)
+            )
         stack.callback(environments.close)
         stretch = Stretch(parts, run, replay, environments, metrics, view, interrupt)
         if point is not None:

@@ -14,7 +14,7 @@ from merl.agents.ddpg import DDPG
 from merl.config import TrainConfig
 from merl.core import Batch
 from merl.networks.settings import torch_settings
-from merl.replay import Lanes
+from merl.replay import ReplayBuffer
 from merl.replay.on_device import OnDevice, bytes_on_device
 from merl.training.loop import Randomness, Update
 
@@ -23,7 +23,7 @@ ROOM = 0.8
 
 
 def update_from_host(
-    agent: DDPG, replay: Lanes, randomness: Randomness, config: TrainConfig
+    agent: DDPG, replay: ReplayBuffer, randomness: Randomness, config: TrainConfig
 ) -> Update:
     """Batches drawn from the replay on the host, for an agent on the CPU.
 
@@ -41,7 +41,7 @@ def update_from_host(
 
 def make_update(
     agent: DDPG,
-    replay: Lanes,
+    replay: ReplayBuffer,
     randomness: Randomness,
     config: TrainConfig,
     warn: Callable[[str], None],
@@ -72,7 +72,7 @@ def make_update(
 
 def _fastest_update(
     agent: DDPG,
-    replay: Lanes,
+    replay: ReplayBuffer,
     randomness: Randomness,
     config: TrainConfig,
     warn: Callable[[str], None],
@@ -82,10 +82,10 @@ def _fastest_update(
         torch.cuda.empty_cache()  # what was timed is gone, but torch keeps its memory
         if config.replay.compress:
             warn("a compressed replay stays on the host: each update's batch is brought over")
-        elif bytes_on_device(replay.lanes) > ROOM * torch.cuda.mem_get_info()[0]:
+        elif bytes_on_device(replay.rings) > ROOM * torch.cuda.mem_get_info()[0]:
             warn("the replay does not fit on the GPU: each update's batch is brought over")
         else:
-            copy = OnDevice(replay.lanes, agent.device)
+            copy = OnDevice(replay.rings, agent.device)
             seed = randomness.on_device(updates)
             return UpdateOnDevice(agent, copy, config.replay.batch_size, seed)
         size = config.replay.batch_size

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.core import MerlError, meant
+from merl.core import MerlError, suggest
 from merl.envs.config import LARGEST_IMAGE, check_samples, check_whole
 from merl.envs.raster.scene import Scene, build_scene
 from merl.envs.warp_runtime import compiling, start_warp
@@ -287,7 +287,7 @@ def _camera_of(model: Any, name: str) -> int:
     index = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name))
     if index < 0:
         known = [model.camera(n).name for n in range(model.ncam)]
-        raise MerlError(f"the model has no camera {name!r}: {meant(name, known)}")
+        raise MerlError(f"the model has no camera {name!r}: {suggest(name, known)}")
     is_perspective = model.cam_projection[index] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
     if not is_perspective or model.cam_sensorsize[index].any():
         raise MerlError(

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Draws:
+class UpdateNoise:
     """The random numbers of one update.
 
     Attributes:

@@ -20,7 +20,7 @@ class Move(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Places:
+class RingIndex:
     """Entries are numbered as they come, 0, 1, 2, ...; number i lies at (i - origin) mod length.
 
     Attributes:
@@ -39,7 +39,7 @@ class Places:
         """The least length that `longer` can make of it."""
         return self.length + (min(self._parts(end)) if self._has_come_round(end) else 0)
 
-    def longer(self, length: int, end: int) -> tuple[Places, Move | None]:
+    def longer(self, length: int, end: int) -> tuple[RingIndex, Move | None]:
         """The places of a longer ring, and what has to be moved within it for that.
 
         Where the ring has come round, its oldest entries lie behind its newest: one of the two is
@@ -51,12 +51,12 @@ class Places:
             end: the number of the next entry.
         """
         if not self._has_come_round(end):
-            return Places(length, self.origin), None
+            return RingIndex(length, self.origin), None
         newer, older = self._parts(end)
         if newer <= older:
             move = Move(0, newer, to=self.length)
-            return Places(length, end - self.length - newer), move if newer else None
-        return Places(length, end - newer - length), Move(newer, older, to=length - older)
+            return RingIndex(length, end - self.length - newer), move if newer else None
+        return RingIndex(length, end - newer - length), Move(newer, older, to=length - older)
 
     def _has_come_round(self, end: int) -> bool:
         return end - self.origin > self.length

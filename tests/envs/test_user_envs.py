@@ -15,8 +15,8 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from merl.core import EnvironmentFailed, MerlError, NotFinite
-from merl.envs.adapted import in_one_line
-from merl.envs.own import adapt, load_module, make_own
+from merl.envs.user_env import adapt, load_module, make_user_env
+from merl.envs.wrappers import in_one_line
 
 
 class Given(gymnasium.Env[Any, Any]):
@@ -125,8 +125,8 @@ def test_what_cannot_be_learnt_in_is_refused(space: Any, actions: Any, says: str
 
 
 def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> None:
-    assert make_own("merl.envs.dot:whole", "rgb_array").render_mode == "rgb_array"
-    pendulum = make_own("Pendulum-v1")
+    assert make_user_env("merl.envs.dot:whole", "rgb_array").render_mode == "rgb_array"
+    pendulum = make_user_env("Pendulum-v1")
     assert set(pendulum.observation_space) == {"state"}  # type: ignore[call-overload]
     (tmp_path / "my_robot_here.py").write_text(
         "import gymnasium\n"
@@ -137,8 +137,8 @@ def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> 
     )
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
     load_module("my_robot_here:make", tmp_path)
-    assert make_own("my_robot_here:make").unwrapped.g == 1.0  # type: ignore[attr-defined]
-    assert make_own("my_robot_here:Robot-v7", "rgb_array").render_mode is None
+    assert make_user_env("my_robot_here:make").unwrapped.g == 1.0  # type: ignore[attr-defined]
+    assert make_user_env("my_robot_here:Robot-v7", "rgb_array").render_mode is None
     for task, says in {
         "Pendulm-v1": "did you mean 'Pendulum-v1'",
         "reach_dulpo": "did you mean 'reach_duplo'",
@@ -150,7 +150,7 @@ def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> 
         "CartPole-v1": "Discrete",
     }.items():
         with pytest.raises(MerlError, match=says):
-            make_own(task)
+            make_user_env(task)
 
 
 class Lying(Given):
@@ -175,7 +175,7 @@ def test_what_an_environment_gives_is_held_to_its_space(keys: tuple[str], says: 
 
 @pytest.mark.parametrize("task", ["merl.envs.dot:whole", "merl.envs.dot:split"])
 def test_the_dot(task: str) -> None:
-    env = make_own(task, "rgb_array")
+    env = make_user_env(task, "rgb_array")
     check_env(env.unwrapped, skip_render_check=True)
     returns = {}
     for name in ("straight", "still"):
@@ -342,7 +342,7 @@ def test_a_place_that_cannot_be_opened_is_not_named(tmp_path: Path) -> None:
     installed = tmp_path / "lib" / "site-packages" / "driver.py"
     assert "driver.py" not in place_of(installed, code)
     assert place_of(tmp_path / "merl_arm.py", code).endswith("(merl_arm.py, line 2)")
-    with patch("merl.envs.adapted.__file__", str(tmp_path / "merl" / "envs" / "adapted.py")):
+    with patch("merl.envs.wrappers.__file__", str(tmp_path / "merl" / "envs" / "wrappers.py")):
         assert "dot.py" not in place_of(tmp_path / "merl" / "dot.py", code)
         assert place_of(tmp_path / "merl_arm" / "arm.py", code).endswith("(arm.py, line 2)")
     (tmp_path / "gone.py").write_text(code)

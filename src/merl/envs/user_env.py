@@ -16,12 +16,12 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import registry
 
-from merl.core import MerlError, meant
+from merl.core import MerlError, suggest
 from merl.core.python_path import set_value, users_value
-from merl.envs.adapted import adapt, failing, in_one_line
 from merl.envs.config import UserEnvConfig
 from merl.envs.packages import installing
 from merl.envs.registration import ENV_IDS
+from merl.envs.wrappers import adapt, failing, in_one_line
 
 BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that come with merl."""
@@ -29,7 +29,7 @@ CLOSE = 0.8
 """How similar an unknown id must be to a known one to be a mistyped form of it."""
 
 
-def make_own(
+def make_user_env(
     task: str, render_mode: str | None = None, config: UserEnvConfig | None = None
 ) -> gymnasium.Env[Any, Any]:
     """An environment that merl does not bring along, in the form that agents take.
@@ -106,10 +106,10 @@ def load_module(task: str, *folders: Path) -> ModuleType:
             raise MerlError(
                 f"task {task!r}: {module!r} imports {error.name!r}, which is not installed here"
             ) from None
-        places = " or ".join([*map(str, folders), "what is installed"])
+        ring_index = " or ".join([*map(str, folders), "what is installed"])
         way = installing(task.partition(":")[2], module)
         way = way or "name its folder in PYTHONPATH, or call `merl train` where it lies"
-        raise MerlError(f"task {task!r}: {error} in {places}: {way}") from None
+        raise MerlError(f"task {task!r}: {error} in {ring_index}: {way}") from None
     except Exception as error:
         raise MerlError(
             f"task {task!r}: importing {module!r} failed: {in_one_line(error)}"
@@ -162,7 +162,7 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
         raise MerlError(f"task {task!r} is merl's own: call it {known}")
     if not colon:
         if task not in registry:
-            way = installing(task) or meant(task, [*ENV_IDS, *registry], CLOSE)
+            way = installing(task) or suggest(task, [*ENV_IDS, *registry], CLOSE)
             if not way.startswith(("did", "it comes")):
                 way = f"choose from {', '.join(ENV_IDS)}, or name a Gymnasium id or module:function"
             raise MerlError(f"task {task!r} is unknown: {way}")
@@ -172,7 +172,7 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
     if make is None:
         if name in registry:
             return _by_id(name, render_mode)
-        way = meant(name, registry, CLOSE)
+        way = suggest(name, registry, CLOSE)
         raise MerlError(
             f"task {task!r}: module {module!r} has no function {name!r}, and registers no "
             f"environment of that name{f': {way}' if way.startswith('did') else ''}"

@@ -11,29 +11,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from merl.core import Batch, Copies, Copy
-from merl.replay.config import ReplayConfig, check_fits, lane_capacity
-from merl.replay.ring import Replay
+from merl.core import Batch, FrameTransform, FrameTransforms
+from merl.replay.config import ReplayConfig, check_fits, ring_capacity
+from merl.replay.ring import EpisodeRing
 
 
-class Lanes:
+class ReplayBuffer:
     """A ring for each environment, so that episodes that grow side by side stay in one piece.
 
     Every step that any of them holds is sampled with the same probability.
 
     Args:
         config: what is kept and how it is sampled.
-        observation_space: see `Replay`.
-        action_space: see `Replay`.
+        observation_space: see `EpisodeRing`.
+        action_space: see `EpisodeRing`.
         count: of environments.
         directory: where the rings lie; one alone lies there itself, several in folders 0, 1, ...
         capacity: steps that are kept in all, in place of the config's.
 
     Attributes:
-        lanes: the rings, in the environments' order.
+        rings: the rings, in the environments' order.
 
     Raises:
-        MerlError: see `Replay`.
+        MerlError: see `EpisodeRing`.
     """
 
     def __init__(
@@ -53,44 +53,44 @@ class Lanes:
             action_space,
             directory=directory,
             capacity=whole,
-            lanes=count,
+            rings=count,
         )
-        self.lanes = [
-            Replay(
+        self.rings = [
+            EpisodeRing(
                 config,
                 observation_space,
                 action_space,
                 directory=directory if directory is None or count == 1 else directory / str(index),
-                capacity=lane_capacity(whole, count),
+                capacity=ring_capacity(whole, count),
             )
             for index in range(count)
         ]
 
     def __len__(self) -> int:
         """Steps that can be sampled now."""
-        return sum(len(lane) for lane in self.lanes)
+        return sum(len(ring) for ring in self.rings)
 
     def sample(
         self,
         batch_size: int,
         rng: np.random.Generator,
-        now: Copies | None = None,
-        then: Copies | None = None,
+        now: FrameTransforms | None = None,
+        then: FrameTransforms | None = None,
     ) -> Batch:
-        """Draw steps uniformly, with replacement; those of one lane lie side by side.
+        """Draw steps uniformly, with replacement; those of one ring lie side by side.
 
-        Arguments, batch and errors are those of `Replay.sample`.
+        Arguments, batch and errors are those of `EpisodeRing.sample`.
         """
-        if len(self.lanes) == 1 or not len(self):
-            return self.lanes[0].sample(batch_size, rng, now, then)
-        shares = np.array([len(lane) for lane in self.lanes]) / len(self)
+        if len(self.rings) == 1 or not len(self):
+            return self.rings[0].sample(batch_size, rng, now, then)
+        shares = np.array([len(ring) for ring in self.rings]) / len(self)
         counts = rng.multinomial(batch_size, shares)
         firsts = np.cumsum(counts) - counts
         return _joined(
             [
-                lane.sample(count, rng, _from(first, now), _from(first, then))
-                for lane, count, first in zip(
-                    self.lanes, counts.tolist(), firsts.tolist(), strict=True
+                ring.sample(count, rng, _from(first, now), _from(first, then))
+                for ring, count, first in zip(
+                    self.rings, counts.tolist(), firsts.tolist(), strict=True
                 )
                 if count
             ]
@@ -98,35 +98,35 @@ class Lanes:
 
     def flush(self) -> None:
         """Have everything written reach the disk; returns when it has."""
-        for lane in self.lanes:
-            lane.flush()
+        for ring in self.rings:
+            ring.flush()
 
     def settle(self) -> None:
         """A checkpoint of the present state is on the disk: no older one is to be gone back to."""
-        for lane in self.lanes:
-            lane.settle()
+        for ring in self.rings:
+            ring.settle()
 
     def state_dict(self) -> dict[str, Any]:
-        """As `Replay.state_dict`; of several lanes theirs, and whether any is in an episode."""
-        states: list[dict[str, Any]] = [lane.state_dict() for lane in self.lanes]
+        """As `EpisodeRing.state_dict`; with several rings, the states of all."""
+        states: list[dict[str, Any]] = [ring.state_dict() for ring in self.rings]
         if len(states) == 1:
             return states[0]
-        return {"lanes": states, "open": any(state["open"] for state in states)}
+        return {"rings": states, "open": any(state["open"] for state in states)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go back to what `state_dict` said; see `Replay.load_state_dict`.
+        """Go back to what `state_dict` said; see `EpisodeRing.load_state_dict`.
 
         Raises:
             MerlError: a ring does not hold what the state names.
         """
-        for lane, its in zip(self.lanes, state.get("lanes", [state]), strict=True):
-            lane.load_state_dict(its)
+        for ring, its in zip(self.rings, state.get("rings", [state]), strict=True):
+            ring.load_state_dict(its)
 
 
-def _from(first: int, copies: Copies | None) -> Copies | None:
+def _from(first: int, copies: FrameTransforms | None) -> FrameTransforms | None:
     """The copies for a part of the batch that begins with sample `first`."""
 
-    def of_part(copy: Copy) -> Copy:
+    def of_part(copy: FrameTransform) -> FrameTransform:
         return lambda sample, frames, out: copy(first + sample, frames, out)
 
     return copies and {key: of_part(copy) for key, copy in copies.items()}

@@ -40,7 +40,7 @@ from merl.bench.measuring import circumstances, spread
 from merl.core import MerlError
 from merl.networks.critic import TwinCritic
 from merl.replay.on_device import OnDevice
-from merl.training.parts import choose_device
+from merl.training.setup import choose_device
 from merl.training.updating import Recorded, UpdateOnDevice
 
 

@@ -16,24 +16,22 @@ from unittest.mock import patch
 import tyro
 
 from merl.experiments.presets import compose
-from merl.experiments.small_tasks import Silent
-from merl.training import trainer
-from merl.training.parts import Parts
-from merl.training.stretch import Stretch
+from merl.training.saving import Saver
+from merl.training.trainer import Trainer
 
 
 def main(preset: str = "laptop", task: str = "reach_duplo", steps: int = 3000) -> None:
     """Train for so many steps, an update for every fiftieth, and print what a save took."""
     taken: list[float] = []
-    save = Stretch._save
+    save = Saver.save
 
-    def timed(stretch: Stretch) -> bool:
+    def timed(saver: Saver) -> bool:
         begun = time.perf_counter()
-        done = save(stretch)
+        done = save(saver)
         taken.append(time.perf_counter() - begun)
         return done
 
-    with patch.object(Stretch, "_save", timed), tempfile.TemporaryDirectory(dir=".") as folder:
+    with patch.object(Saver, "save", timed), tempfile.TemporaryDirectory(dir=".") as folder:
         config = dataclasses.replace(
             compose(preset, task),
             steps=steps,
@@ -46,8 +44,8 @@ def main(preset: str = "laptop", task: str = "reach_duplo", steps: int = 3000) -
         config = dataclasses.replace(
             config, eval=dataclasses.replace(config.eval, every=steps, episodes=2, video="none")
         )
-        with Parts.prepare(config, new=True) as parts:
-            trainer.start(parts, Silent())
+        with Trainer(config) as trainer:
+            trainer.fit()
         newest = max((config.run_dir / "checkpoints").iterdir()) if config.run_dir else Path()
         size = sum(file.stat().st_size for file in newest.iterdir())
     every = compose(preset, task).save_every

@@ -1,11 +1,11 @@
 """merl: multimodal end-to-end reinforcement learning for robot arms.
 
-The public names are loaded when first used, so that a room which needs neither torch nor MuJoCo
-(`merl.report`) does not pay for them.
+The public names are loaded on first use, so that a package that needs neither torch nor MuJoCo
+(`merl.report`) does not import them.
 """
 
-# Before these lines nothing is imported that Python has not loaded itself: `python -m merl.cli`
-# searches the working folder first, and that folder may be the run of a stranger.
+# Import nothing before these lines except what Python itself has loaded: `python -m merl.cli`
+# searches the working folder first, and that folder may be an untrusted run folder.
 import os
 import sys
 
@@ -13,11 +13,11 @@ if sys.argv[:1] == ["-m"] and "merl.cli" in sys.orig_argv and not sys.flags.safe
     try:
         if sys.path[0] == os.getcwd():  # noqa: PTH109 (pathlib is not loaded yet)
             del sys.path[0]
-    except OSError:  # the working folder was removed, so it is not searched
+    except OSError:  # the working folder was deleted, so Python cannot search it
         pass
     _source = __file__.removesuffix(f"{os.sep}merl{os.sep}__init__.py")
     if _source not in sys.path:
-        sys.path.append(_source)  # merl lies in the working folder; worker processes need it
+        sys.path.append(_source)  # merl is in the working folder; worker processes need the path
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,4 @@
-"""What a run is: one frozen value that the command line is made from and `config.json` records."""
+"""The config of a run: frozen dataclasses that define the command line and `config.json`."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from merl.replay import ReplayConfig
 Setting = Literal["matched", "published"]
 
 MOST_STEPS = 10**12
-"""Far beyond what anyone will wait for."""
+"""Upper limit of `steps` and similar fields, far beyond any real run."""
 MOST_ENVS = 1024
-"""Processes that one machine may bear."""
+"""Upper limit of `num_envs`, each of which may be a process."""
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How often the agent shows what it has learnt: without noise, on the same fixed starts."""
+    """Settings of the evaluations: the agent acts without noise, from fixed start states."""
 
     every: int = 10_000
-    """Steps between evaluations; 0 for none, at the end neither: then the environment is made only
-    once, as a single device needs it."""
+    """Steps between evaluations; 0 for no evaluation at all, not even at the end. Then only one
+    instance of the environment is made, as a single physical robot requires."""
     episodes: int = 10
-    """Episodes of each evaluation."""
+    """Number of episodes of each evaluation."""
     start: tuple[StartName, ...] | None = None
-    """Where the hand starts in evaluations (see `--start`); as in training, if not set."""
+    """Start of the hand in evaluations (see `--start`); if not set, the same as in training."""
     max_episode_steps: int = 2000
-    """Steps after which an episode of an evaluation is cut, if it has not ended by itself."""
+    """Limit in steps for evaluation episodes that do not end earlier."""
     video: Literal["each", "last", "none"] = "each"
-    """Which evaluations to film (their first episode)."""
+    """Evaluations of which a video is made (of the first episode)."""
     references: bool = False
-    """At the end, take 20 episodes each of random actions and of none to compare with, where merl
-    does not know their returns. Set for merl's own tasks; on an environment of your own it moves
-    your robot at random."""
+    """At the end, run 20 episodes with random actions and 20 with zero actions for comparison, if
+    merl does not know their returns. On by default for merl's own tasks. In your own environment
+    this moves your robot at random."""
 
     def __post_init__(self) -> None:
         for name, least in (("every", 0), ("episodes", 1), ("max_episode_steps", 1)):
@@ -51,7 +51,7 @@ class EvaluationConfig:
                 raise MerlError(f"eval.{flag} must be at least {least}, not {getattr(self, name)}")
 
     def count(self, steps: int) -> int:
-        """Return the number of evaluations of a run of `steps` steps."""
+        """Return the number of evaluations in a run of `steps` steps."""
         return max(1, steps // self.every) if self.every else 0
 
 
@@ -59,60 +59,61 @@ class EvaluationConfig:
 class TrainConfig:
     """Train an agent on a task.
 
-    Without a preset these are Table 1's values; `merl train` takes them from the preset that it
-    names in its first line.
+    The defaults here are the values of Table 1. `merl train` takes its defaults from a preset and
+    prints the preset's name in its first line.
     """
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-    """What is to be learnt: reach_duplo, move_box, lift_box, a Gymnasium id, or module:function
-    that makes an environment."""
+    """Task: reach_duplo, move_box, lift_box, the id of a Gymnasium environment, or module:function,
+    where the function makes an environment."""
     preset: str = "paper"
-    """paper, laptop, state or smoke: which set of values the others are taken from."""
+    """Set of default values for the other options: paper, laptop, state or smoke."""
     agent_name: Annotated[str, tyro.conf.arg(name="agent", metavar="|".join(AGENTS))] = "merl"
-    """Who learns. merl: camera and joints; drqv2: camera; proprio: joints; merl_state, ddpg, sac:
-    the state."""
+    """Agent and the observations that it uses. merl: camera and joints; drqv2: camera; proprio:
+    joints; merl_state, ddpg, sac: state."""
     setting: Setting = "matched"
-    """Whose numbers the agent has: MERL's and the preset's (matched), or its authors'
+    """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
     (published)."""
     seed: int = 0
-    """The seed of everything random in the run."""
+    """Seed of all randomness in the run."""
     steps: int = 1_000_000
-    """Environment steps."""
+    """Number of environment steps."""
     measure: bool = False
-    """Time an environment of your own before the run begins, as merl's own tasks are, with 75
-    random steps; if not set, the first steps of the run are timed."""
+    """Time your own environment with 75 random steps before the run starts, as merl does for its own
+    tasks; if not set, the first steps of the run are timed."""
     minutes: float | None = None
-    """Stop after this many minutes (since start or resume), if the steps are not done before."""
+    """Time limit of the run in minutes, since start or resume."""
     run_dir: Path | None = None
-    """The run's folder, which must not exist yet; runs/TASK-AGENT-PRESET-sSEED (or -2, -3, ...) if
-    not set."""
+    """Folder of the run, which must not exist yet; if not set, runs/TASK-AGENT-PRESET-sSEED (with
+    -2, -3, ... if that exists)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where the networks live; auto takes CUDA where it is there."""
+    """Device of the networks; auto uses CUDA if it is available."""
     threads: int | None = None
-    """Processor threads of the update; if not set, one, or all where that is clearly faster."""
+    """CPU threads of the update; if not set, one, or all of them if that is clearly faster."""
     random_steps: int = 2000
-    """Steps of uniformly random actions at the start ("exploration steps" in Table 1)."""
+    """Steps with uniformly random actions at the start ("exploration steps" in Table 1)."""
     seed_steps: int = 4000
     """Steps before the first update ("seed frames" in Table 1)."""
     updates_per_step: float = 1.0
-    """Updates for each environment step; below 1, an update every few steps."""
+    """Updates per environment step; below 1, there is one update every few steps."""
     action_repeat: int = 1
-    """Environment steps for which an action is held; all steps here are environment steps."""
+    """Environment steps for which each action is repeated; all other options count environment
+    steps."""
     num_envs: int = 1
-    """Environments that act at the same time; more than one, each has a process of its own."""
+    """Number of parallel environments; if more than one, each runs in its own process."""
     synchronous: bool = True
-    """The learner waits for the environments' steps. If not (--no-synchronous), they act in
-    processes of their own while it learns, and an update does not know the newest step yet."""
+    """Learn only after the environments have finished their step. With --no-synchronous they step
+    in worker processes during the update, and an update does not use the newest step yet."""
     worker_restarts: int = 10
-    """How often environments' processes are started again when one dies or does not answer, before
-    the run is saved and ended."""
+    """Number of times that the worker processes are restarted because one died or did not answer;
+    after that, the run is saved and ends."""
     worker_timeout: float = 30.0
-    """Seconds in which an environment's process has to answer."""
+    """Seconds within which a worker process must answer."""
     save_every: float = 300.0
-    """Seconds between checkpoints; each waits for the end of an episode, unless that takes much
-    longer."""
+    """Seconds between checkpoints; a checkpoint waits for the end of an episode, unless that takes
+    much longer."""
     keep: int = 2
-    """How many of the last checkpoints are kept, beside the best."""
+    """Number of recent checkpoints to keep, in addition to the best one."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(
         default_factory=lambda: EnvConfig(renderer="gl")
     )
@@ -128,7 +129,7 @@ class TrainConfig:
         kind = type(AGENTS[self.agent_name])
         if type(self.agent) is not kind:
             raise MerlError(
-                f"agent {self.agent_name!r} is made from a {kind.__name__}, not from a "
+                f"agent {self.agent_name!r} needs a config of type {kind.__name__}, not "
                 f"{type(self.agent).__name__}"
             )
         most = {"num_envs": MOST_ENVS}
@@ -144,15 +145,16 @@ class TrainConfig:
                 raise MerlError(f"{flag} must be at least 0, not {getattr(self, name)}")
         if self.minutes is not None and not self.minutes > 0:
             raise MerlError(f"minutes must be above 0, not {self.minutes}")
-        if not 0 < self.worker_timeout <= 1e6:  # some 2e6 s are more than a poll can wait
+        if not 0 < self.worker_timeout <= 1e6:  # a poll cannot wait for about 2e6 s or more
             raise MerlError(
                 f"worker-timeout must be above 0 and at most 1e6 seconds, not {self.worker_timeout}"
             )
         if self.eval.start is not None and self.own_env:
             raise MerlError(
-                f"eval.start is for merl's own tasks: {self.task} decides where it starts"
+                f"eval.start is for merl's own tasks only: {self.task} sets its own start states; "
+                "leave the option out"
             )
-        _ = self.evaluated  # its values are checked
+        _ = self.evaluated  # making this config checks its values
         if self.threads is not None and self.threads < 1:
             raise MerlError(f"threads must be at least 1, not {self.threads}")
         for name in ("updates_per_step", "save_every"):
@@ -162,18 +164,18 @@ class TrainConfig:
         if self.replay.batch_size > self.capacity:
             raise MerlError(
                 f"replay.batch-size {self.replay.batch_size} is more than the "
-                f"{counted(self.capacity, 'step')} of the run, which is all that the replay will "
-                "hold: use a smaller batch or more steps"
+                f"{counted(self.capacity, 'step')} that the replay will hold: use a smaller batch "
+                "or more steps"
             )
 
     @property
     def own_env(self) -> bool:
-        """Whether the environment is the user's own, not one of merl's tasks."""
+        """Return whether the environment is the user's own and not one of merl's tasks."""
         return self.task not in ENV_IDS
 
     @property
     def evaluated(self) -> TrainConfig:
-        """The same with the environment that evaluations take place in."""
+        """Return this config with `eval.start` as the start of the environment."""
         if self.eval.start is None:
             return self
         env, evaluation = replace(self.env, start=self.eval.start), replace(self.eval, start=None)
@@ -181,15 +183,15 @@ class TrainConfig:
 
     @property
     def has_workers(self) -> bool:
-        """Whether environments act in processes of their own."""
+        """Return whether the environments run in worker processes."""
         return self.num_envs > 1 or not self.synchronous
 
     @property
     def eval_steps(self) -> int:
-        """Actions after which an episode of an evaluation is cut; each may be held for steps."""
+        """Return the limit of an evaluation episode in actions, each of which may be repeated."""
         return math.ceil(self.eval.max_episode_steps / self.action_repeat)
 
     @property
     def capacity(self) -> int:
-        """Steps that the replay holds: no more than the run takes, a held action counted once."""
+        """Return the capacity of the replay, at most the actions that the whole run takes."""
         return min(self.replay.capacity, math.ceil(self.steps / self.action_repeat))

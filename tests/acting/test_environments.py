@@ -295,7 +295,7 @@ def test_a_signal_is_heeded_between_the_updates_of_a_step(
     with monkeypatch.context() as patch:
         patch.setattr(DDPG, "learn", signalled)
         patch.setattr(
-            "merl.training.parts.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
+            "merl.training.setup.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
         )
         flags = ("--updates-per-step", "50", "--replay.batch-size", "8")
         assert train(run, "plain", *flags, steps=22) == 128 + signal.SIGTERM

@@ -17,7 +17,7 @@ from merl.core import EnvironmentFailed, MerlError
 from merl.envs.config import EnvConfig
 from merl.runs.plain import from_plain, to_plain
 from merl.runs.resume import merge_resume_config
-from merl.training.parts import Parts
+from merl.training.setup import Setup
 from toy import DotEnv
 
 SMALL = EnvConfig(renderer="raster", image_size=32)
@@ -208,7 +208,7 @@ def test_a_run_evaluates_in_the_environment_that_its_evaluations_start_in(tmp_pa
         threads=1,
         run_dir=tmp_path / "run",
     )
-    with Parts.prepare(config, new=True) as parts:
+    with Setup.prepare(config, new=True) as parts:
         trained: Any = parts.env.unwrapped
         assert parts.eval_env is not None
         evaluated: Any = parts.eval_env.unwrapped

@@ -40,7 +40,7 @@ SMALL_VIDEO = ["--render-size", "64"]
 def small_videos() -> Iterator[None]:
     """Let frames be traced at less than the least size; they are enlarged to it."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("merl.training.parts", "merl.cli.evaluate"):
+        for module in ("merl.training.setup", "merl.cli.evaluate"):
             patch.setattr(f"{module}.MIN_SIDE", 16)
         yield
 
@@ -579,7 +579,7 @@ def test_ctrl_c_before_training_says_that_nothing_was_written(
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("merl.training.parts.measure", stop)
+    monkeypatch.setattr("merl.training.setup.measure", stop)
     assert main(["train", "reach_duplo", "--preset", "smoke"]) == 130
     assert "nothing was written" in flat(capsys.readouterr().out)
     assert list(tmp_path.iterdir()) == []

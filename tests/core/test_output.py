@@ -66,7 +66,7 @@ def test_a_run_goes_on_to_its_end(
     monkeypatch.chdir(tmp_path)
     stream = broken()
     monkeypatch.setattr(sys, name, stream)
-    monkeypatch.setattr("merl.training.stretch.Stretch._is_to_stop", _warns)
+    monkeypatch.setattr("merl.training.trainer.Trainer._is_to_stop", _warns)
     assert main(LINE.split()) == 0
     assert getattr(sys, name) is stream or stream is None
     assert (tmp_path / "run" / "checkpoints" / "00000400").is_dir()

@@ -11,7 +11,7 @@ from merl.agents.config import AgentConfig
 from merl.agents.sac import SACConfig
 from merl.core import MerlError
 from merl.networks.returns import HLGauss
-from merl.training.parts import bounded
+from merl.training.setup import bounded
 
 TARGETS = [-1e6, -5.0, -2.0, -1.999, 0.0, 0.01, 3.3, 7.0, 7.999, 8.0, 8.001, 50.0, 1e6]
 

@@ -45,7 +45,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "merl.training.parts.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
+        "merl.training.setup.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
     )
     monkeypatch.setattr("merl.report.figures.learning_curve", lambda run, to, **_: to)
     yield
@@ -90,7 +90,7 @@ def test_an_evaluation_that_fails_leaves_a_saved_run_that_can_be_resumed(
     assert saved()[-1] == step
     # It is repeated once; one that still fails is left out, and the run comes to its end.
     assert main(["resume", "run"]) == 0
-    assert "the run goes on without it" in " ".join(capsys.readouterr().out.split())
+    assert "the run continues without it" in " ".join(capsys.readouterr().out.split())
     assert saved()[-1] == 60
     assert evaluated() == []
     assert main(["resume", "run"]) == 0
@@ -349,7 +349,7 @@ def test_an_episode_without_end_is_saved_and_warned_of(
 ) -> None:
     """It is killed once it has been saved, as by SIGKILL."""
     monkeypatch.setattr("merl.training.meters.Interval.LEAST", 0.01)
-    monkeypatch.setattr("merl.training.stretch.LONG", 30)
+    monkeypatch.setattr("merl.training.trainer.LONG", 30)
     unruly.length = 10**9
 
     def killed(env: Any, seen: Any) -> Any:
@@ -359,7 +359,7 @@ def test_an_episode_without_end_is_saved_and_warned_of(
 
     unruly.in_training = killed
     # As if there were no time to save: what is on the disk is from before.
-    monkeypatch.setattr("merl.training.stretch.EnvironmentFailed", ZeroDivisionError)
+    monkeypatch.setattr("merl.training.trainer.EnvironmentFailed", ZeroDivisionError)
     assert train("--save-every", "0", "--eval.every", "0", "--steps", "100000") == 4
     said = " ".join(capsys.readouterr().out.split())
     assert "no episode has ended in 30 steps" in said

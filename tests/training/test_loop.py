@@ -54,13 +54,13 @@ class Parts:
         self.replay = ReplayBuffer(config.replay, space, actions, capacity=config.steps)
         self.progress = Progress()
         self.update: Update = update_from_host(self.agent, self.replay, self.randomness, config)
-        self.stage = Collector(
+        self.collector = Collector(
             InProcessEnvs(self.env), self.replay, [FrameStack(3, ("image",), CPU)]
         )
 
     def moments(self) -> Iterator[StepResult]:
         return train(
-            self.stage, self.agent, self.update, self.progress, self.randomness, self.config
+            self.collector, self.agent, self.update, self.progress, self.randomness, self.config
         )
 
     def run(self) -> list[StepResult]:
@@ -87,7 +87,7 @@ def stopped_after(update: int, parts: Parts) -> StepResult:
         stop = stop or parts.progress.updates == update
         return whole()
 
-    arguments = parts.stage, parts.agent, stopping, parts.progress, parts.randomness, parts.config
+    arguments = parts.collector, parts.agent, stopping, parts.progress, parts.randomness, parts.config
     for moment in train(*arguments, lambda: stop):
         if stop:
             return moment
@@ -148,7 +148,7 @@ def test_who_is_stopped_in_what_was_left_takes_no_step() -> None:
     assert stopped_after(67, parts).updates == 68
     assert parts.progress.step == 30
     stopping = train(
-        parts.stage, parts.agent, parts.update, parts.progress, parts.randomness, MANY, lambda: True
+        parts.collector, parts.agent, parts.update, parts.progress, parts.randomness, MANY, lambda: True
     )
     assert next(stopping).step == 30
     assert parts.progress.updates == 68
@@ -196,9 +196,9 @@ def test_a_gpu_is_told_what_to_learn_before_its_actions_are_waited_for(
 ) -> None:
     parts = Parts(dataclasses.replace(CONFIG, synchronous=synchronous))
     order: list[str] = []
-    update, act = parts.update, parts.stage.act
+    update, act = parts.update, parts.collector.act
     parts.update = lambda: (order.append("learn"), update())[1]
-    parts.stage.act = lambda actions: (order.append("act"), act(actions))[1]  # type: ignore[method-assign, func-returns-value]
+    parts.collector.act = lambda actions: (order.append("act"), act(actions))[1]  # type: ignore[method-assign, func-returns-value]
 
     class OnItsWay(Fetched):
         def __init__(self, tensor: torch.Tensor) -> None:

@@ -128,7 +128,7 @@ def test_who_waits_for_the_end_of_an_episode_is_told(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Those of the dot have 20 steps."""
-    monkeypatch.setattr("merl.training.stretch.LONG", long)
+    monkeypatch.setattr("merl.training.trainer.LONG", long)
     short = [*SHORT, "--agent", "proprio", "--run-dir", str(tmp_path / "r")]
     assert main(["train", "merl.envs.dot:whole", *short]) == 0
     assert main(["resume", str(tmp_path / "r"), "--steps", "280"]) == 0
@@ -269,7 +269,7 @@ def test_what_the_users_code_raises_is_told_and_the_run_saved(
     assert main(["train", task, *SHORT, "--eval.video", "none", "--run-dir", "run"]) == 4
     error = capsys.readouterr().err.strip()
     assert "step raised OSError: servo 3 does not answer (arm_that_fails_step.py, line 2" in error
-    assert f"go on with `merl resume {tmp_path}/run`" in error
+    assert f"resume with `merl resume {tmp_path}/run`" in error
     assert len(error.splitlines()) == 1
     saved = max(int(path.name) for path in Path("run/checkpoints").iterdir())
     assert saved > 0
@@ -293,7 +293,7 @@ def test_a_nan_in_an_evaluation_stops_the_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["train", failing(tmp_path, "evaluation"), *SHORT, "--run-dir", "run"]) == 3
-    assert "'joints' is nan in place 0 at step" in capsys.readouterr().err
+    assert "'joints' is nan at index 0 at step" in capsys.readouterr().err
 
 
 def test_an_arm_that_has_become_another_is_refused(

@@ -29,7 +29,7 @@ from merl.experiments.presets import compose
 from merl.report.curves import read_metrics
 from merl.runs.plain import box, describe, told
 from merl.runs.run import Run
-from merl.training.parts import Parts
+from merl.training.setup import Setup
 
 LENGTH = 5
 SMALL = [
@@ -346,7 +346,7 @@ def test_instances_that_differ_are_refused_at_the_start(
     )
     with (
         pytest.raises(MerlError, match=f"two instances of the environment differ.*{says}") as error,
-        Parts.prepare(config, new=True),
+        Setup.prepare(config, new=True),
     ):
         pass
     assert len(str(error.value).splitlines()) == 1

@@ -27,7 +27,7 @@ from merl.core.resources import keep_freed_memory
 from merl.experiments.presets import compose
 from merl.replay import ReplayBuffer
 from merl.training.loop import Collector, Progress, Randomness, train
-from merl.training.parts import choose_device
+from merl.training.setup import choose_device
 from merl.training.timing import measure, use_threads
 from merl.training.updating import make_update
 
@@ -158,10 +158,10 @@ class _Loop:
         stacks = [FrameStack(frames, images, device) for _ in range(count)]
         agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)
         self._progress = Progress()
-        stage = Collector(environments, replay, stacks)
+        collector = Collector(environments, replay, stacks)
         randomness = Randomness(config.seed)
         update = make_update(agent, replay, randomness, config, lambda _: None)
-        self._moments = train(stage, agent, update, self._progress, randomness, config)
+        self._moments = train(collector, agent, update, self._progress, randomness, config)
 
     def rate(self, steps: int) -> float:
         """Go on by so many steps, or a few more; returns steps per second."""

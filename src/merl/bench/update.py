@@ -24,7 +24,7 @@ from merl.bench.plain import Encoder, Plain, Sample
 from merl.core import Batch, MerlError, Transition, counted
 from merl.replay import EpisodeRing, ReplayConfig
 from merl.replay.on_device import OnDevice
-from merl.training.parts import choose_device
+from merl.training.setup import choose_device
 from merl.training.timing import Arithmetic
 from merl.training.updating import Recorded, UpdateOnDevice
 

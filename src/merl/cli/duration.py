@@ -12,10 +12,10 @@ from rich.console import Console
 from merl.config import TrainConfig
 from merl.core import counted
 from merl.evaluation.evaluation import Evaluation
-from merl.training.console import ConsoleView
+from merl.training.live_view import LiveView
 from merl.training.loop import StepResult
-from merl.training.parts import Parts
 from merl.training.timing import Timing
+from merl.training.trainer import Trainer
 
 FIRST_STEPS = 50
 """Steps of the environment, from which its time per step is taken."""
@@ -45,43 +45,48 @@ def duration(config: TrainConfig, timing: Timing, done: int) -> str:
     return f"{steps} {where} {'takes' if left == 1 else 'take'} {about}{bound}"
 
 
-class DurationView(ConsoleView):
-    """The live view of a run whose environment was not timed: it times the first steps.
+class DurationView(LiveView):
+    """The live view, which times the first steps if the environment was not timed before.
 
     Args:
         console: where to print.
-        parts: what the run is made of.
-        scale: see `ConsoleView`.
+        scale: see `LiveView`.
     """
 
-    def __init__(self, console: Console, parts: Parts, scale: Mapping[str, float]) -> None:
+    def __init__(self, console: Console, scale: Mapping[str, float]) -> None:
         super().__init__(console, scale)
-        self._config, self._timing = parts.config, parts.timing
+        self._timing: Timing | None = None  # until the duration is printed
         self._first: tuple[float, StepResult] | None = None  # the time of the first step
-        self._is_said = False
 
-    def moment(self, moment: StepResult, metrics: dict[str, float]) -> None:
-        """See `stretch.View`."""
-        super().moment(moment, metrics)
-        if self._is_said:
-            return
+    def on_start(self, trainer: Trainer) -> None:
+        """See `Callback`."""
+        super().on_start(trainer)
+        self._config, timing = trainer.config, trainer.setup.timing
+        self._timing = None if timing.knows_env else timing
+
+    def on_step(self, result: StepResult) -> bool | None:
+        """See `Callback`."""
+        super().on_step(result)
+        if self._timing is None:
+            return None
         now = time.perf_counter()
         if self._first is None:
-            self._first = now, moment
-            return
+            self._first = now, result
+            return None
         start, first = self._first
-        steps = moment.step - first.step
+        steps = result.step - first.step
         if steps < FIRST_STEPS:
-            return
-        self._is_said = True
-        learning = (moment.updates - first.updates) * self._timing.update[self._timing.best]
-        decisions = steps / self._config.action_repeat
-        step = max(0.0, now - start - learning) / decisions
+            return None
+        learning = (result.updates - first.updates) * self._timing.update[self._timing.best]
+        actions = steps / self._config.action_repeat
+        step = max(0.0, now - start - learning) / actions
         timing = dataclasses.replace(self._timing, step=step, knows_env=True)
-        told = duration(self._config, timing, moment.step)
-        self.console.print(f"{told}; a step takes {1000 * step:.1f} ms", highlight=False)
+        self._timing = None
+        line = duration(self._config, timing, result.step)
+        self.console.print(f"{line}; a step takes {1000 * step:.1f} ms", highlight=False)
+        return None
 
-    def evaluated(self, step: int, evaluation: Evaluation) -> None:
-        """See `stretch.View`; the time of the evaluation is not that of the steps."""
-        super().evaluated(step, evaluation)
+    def on_evaluation(self, step: int, evaluation: Evaluation) -> None:
+        """See `Callback`; the time of the evaluation does not count for the steps."""
+        super().on_evaluation(step, evaluation)
         self._first = None

@@ -20,7 +20,7 @@ from merl.evaluation.evaluation import evaluate as evaluate_policy
 from merl.evaluation.video import MIN_SIDE
 from merl.report.references import references
 from merl.runs.run import Run
-from merl.training.console import describe
+from merl.training.live_view import describe
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from merl.core import MerlError, counted
 from merl.core.resources import available_memory, free_disk
 from merl.experiments.presets import compose
 from merl.runs.provenance import machine, package_versions
-from merl.training.parts import Parts
+from merl.training.setup import Setup
 
 TASK = "reach_duplo"
 FEATURES = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
@@ -67,8 +67,8 @@ def _expected(preset: str) -> str:
     """What training would bring, from timing its update and its step."""
     config = compose(preset, TASK)
     try:
-        with Parts.prepare(config, new=False) as parts:
-            timing = parts.timing
+        with Setup.prepare(config, new=False) as setup:
+            timing = setup.timing
     except MerlError as error:
         return str(error)
     update = timing.update[timing.best]

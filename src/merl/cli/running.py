@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.filesize import decimal
 
-from merl.acting.run_env import key_lines, own_bounds
+from merl.acting.run_env import key_lines
 from merl.cli.duration import DurationView, duration
 from merl.cli.output import make_console
 from merl.cli.summary import summarize
@@ -22,10 +22,8 @@ from merl.runs.checkpoint import Checkpoint, readable
 from merl.runs.resume import REOPENED, left_open, merge_resume_config, reopened
 from merl.runs.run import Run
 from merl.runs.run_folder import check_links, resume_line
-from merl.training import trainer
-from merl.training.console import ConsoleView
-from merl.training.parts import Parts, device_name
-from merl.training.stretch import Outcome
+from merl.training.setup import Setup, device_name
+from merl.training.trainer import Outcome, Trainer
 
 DAY = 86_400.0  # seconds
 
@@ -113,23 +111,12 @@ def _train(
     console = make_console()
     with ExitStack() as stack:
         try:
+            view = DurationView(console, _scale(config))
             with console.status("building the scene and timing this machine", spinner="line"):
-                parts = stack.enter_context(Parts.prepare(config, new=resumed is None))
-            if resumed:
-                resumed[0].check_environment(parts.space, parts.action_space, own_bounds(parts.env))
+                trainer = stack.enter_context(Trainer(config, [view], resumed=resumed))
             done = resumed[1].step if resumed and resumed[1] else 0
-            console.print(_outlook(parts, what, done), highlight=False)
-            scale = _scale(config)
-            view = (
-                ConsoleView(console, scale)
-                if parts.timing.knows_env
-                else DurationView(console, parts, scale)
-            )
-            with view:
-                if resumed:
-                    outcome = trainer.resume(parts, *resumed, view)
-                else:
-                    outcome = trainer.start(parts, view)
+            console.print(_outlook(trainer.setup, what, done), highlight=False)
+            outcome = trainer.fit()
         except KeyboardInterrupt:  # from there on a signal is a wish, see `Interrupt`
             console.print("stopped before training began: nothing was written")
             raise
@@ -179,19 +166,19 @@ def _scale(config: TrainConfig) -> dict[str, float]:
     }
 
 
-def _outlook(parts: Parts, what: str, done: int) -> str:
+def _outlook(setup: Setup, what: str, done: int) -> str:
     """Return what is going to happen, and how long it will take on this machine."""
-    config, timing = parts.config, parts.timing
+    config, timing = setup.config, setup.timing
     size = replay_bytes(
-        config.replay, parts.space, parts.action_space, config.capacity, config.num_envs
+        config.replay, setup.space, setup.action_space, config.capacity, config.num_envs
     )
     tried = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
-    seen = not config.own_env and any(is_image(space) for space in parts.space.values())
+    seen = not config.own_env and any(is_image(space) for space in setup.space.values())
     pictures = f" ({config.env.renderer} pictures)" if seen else ""
     lines = [f"{what}: {duration(config, timing, done)}"]
     if timing.seconds(config, done) > DAY and config.preset != "laptop":
         lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
-    lines += key_lines(config, parts.env)
+    lines += key_lines(config, setup.env)
     step = "a step" if timing.knows_env else "a step, without the environment's part"
     lines += [
         f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms {step}{pictures}",

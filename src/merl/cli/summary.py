@@ -15,7 +15,7 @@ from merl.envs.wrappers import in_one_line
 from merl.evaluation.evaluation import Act, Evaluation, evaluate
 from merl.report.references import RANDOM, Reference, references
 from merl.runs.run_folder import resume_line
-from merl.training.stretch import Outcome
+from merl.training.trainer import Outcome
 
 FLOORS = (RANDOM, "no motion")
 """The references that need no skill."""

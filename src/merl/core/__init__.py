@@ -1,4 +1,4 @@
-"""Types, errors and small helpers that every room may use."""
+"""Types, errors and small helpers that every package of merl may import."""
 
 from merl.core.errors import (
     EnvironmentFailed,

@@ -15,36 +15,40 @@ _NEVER = torch.iinfo(torch.int64).max
 
 
 def check_finite(observation: Observation, reward: float, step: int, where: str = "") -> None:
-    """What an environment gave, before it enters the replay.
+    """Check the output of an environment step before it enters the replay.
 
     Args:
-        observation: images need no look, bytes are always numbers.
-        reward: what led there paid.
-        step: environment steps so far.
-        where: what these are the steps of, where not of the run.
+        observation: only float arrays are checked; integers are always finite.
+        reward: the reward of the step.
+        step: environment steps so far, for the message.
+        where: appended to the step in the message, e.g. "of an evaluation".
 
     Raises:
-        NotFinite: naming the value and the step.
+        NotFinite: a value is NaN or infinite, or the reward does not fit into float32; the message
+            names the value and the step.
     """
     at = f"at step {step:,} {where}".rstrip()
     if not abs(reward) <= float(
         np.finfo(np.float32).max
-    ):  # beyond it, the replay would keep infinity
+    ):  # the replay stores float32, in which a larger reward is infinite
         beyond = ", which is beyond float32," if math.isfinite(reward) else ""
         raise NotFinite(f"the environment's reward is {reward}{beyond} {at}")
     for key, value in observation.items():
         value = np.asarray(value)
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             index = np.flatnonzero(~np.isfinite(value))[0]
-            place = f"in place {index} {at}"
+            place = f"at index {index} {at}"
             raise NotFinite(f"the environment's observation {key!r} is {value.flat[index]} {place}")
 
 
 def check_weights(groups: Mapping[str, Mapping[str, Tensor]]) -> None:
-    """Weights, before they are saved.
+    """Check weights before they are saved.
+
+    Args:
+        groups: tensors by name, for each group of networks.
 
     Raises:
-        NotFinite: naming the tensor.
+        NotFinite: a weight is NaN or infinite; the message names its tensor.
     """
     for group, tensors in groups.items():
         for name, tensor in tensors.items():
@@ -53,21 +57,22 @@ def check_weights(groups: Mapping[str, Mapping[str, Tensor]]) -> None:
 
 
 class LossGuard:
-    """Watches what the learner tells of its updates for a NaN or an infinity.
+    """A check of the metrics of each update for NaN and infinity.
 
-    On the CPU it raises at once. On a GPU nothing waits for the card: the first bad step's number
-    stays there until `check` asks for it.
+    On the CPU, `watch` raises immediately. On a GPU it does not synchronize: the number of the
+    first bad step stays on the device until `check` reads it.
     """
 
     def __init__(self) -> None:
-        # The first bad step of each metric, for each set of metrics that updates have.
+        # The first bad step of each metric; updates with different metrics have separate entries.
         self._first: dict[tuple[str, ...], Tensor] = {}
 
     def watch(self, metrics: Mapping[str, Tensor], step: int) -> None:
-        """Take in the metrics of an update at `step`; nothing, if there was none.
+        """Record the metrics of an update at `step`; do nothing if there are no metrics.
 
         Raises:
-            NotFinite: on the CPU, naming the metric and the step.
+            NotFinite: a metric is NaN or infinite (raised here on the CPU only); the message names
+                the metric and the step.
         """
         if not metrics:
             return
@@ -80,10 +85,11 @@ class LossGuard:
             self.check()
 
     def check(self) -> None:
-        """Look at what was watched.
+        """Check all recorded metrics.
 
         Raises:
-            NotFinite: naming the metric that was bad first, and the step.
+            NotFinite: a metric was NaN or infinite; the message names the first bad step and the
+                metrics that were bad at that step.
         """
         first = [
             pair

@@ -1,7 +1,7 @@
-"""Output is an observer: a stream that cannot be written to never ends a run.
+"""Output streams that never end a run: if a write fails, the text is lost and the run continues.
 
-A reader that has gone away (`merl train ... | head -1`), a log on a full disk, a closed terminal
-and a closed descriptor are all the same to a run: what it prints is lost, and the run continues.
+A write can fail because the reader has exited (`merl train ... | head -1`), the log is on a full
+disk, the terminal was closed, or the file descriptor was closed.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import Any, TextIO, cast
 
 
 class TolerantStream:
-    """A text stream that drops what it cannot write; all else is as the stream itself has it.
+    """A text stream that discards text that it cannot write; otherwise like the wrapped stream.
 
     Attributes:
-        error: the first error of a write; None as long as everything was written.
+        error: the first error of a write; None if all writes succeeded.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -27,8 +27,8 @@ class TolerantStream:
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:
-        """Write what can be written; a character that the encoding lacks is escaped."""
-        with self._noting():
+        """Write text if possible; escape characters that the encoding does not have."""
+        with self._recording_error():
             try:
                 self._stream.write(text)
             except UnicodeEncodeError:
@@ -37,24 +37,24 @@ class TolerantStream:
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
-        """See `write`."""
+        """Write each line; see `write`."""
         for line in lines:
             self.write(line)
 
     def flush(self) -> None:
-        """Flush what can be flushed."""
-        with self._noting():
+        """Flush the stream if possible."""
+        with self._recording_error():
             self._stream.flush()
 
     def isatty(self) -> bool:
-        """Whether it is a terminal; a stream that is closed is none."""
+        """Return whether the stream is a terminal; False if it is closed."""
         try:
             return self._stream.isatty()
         except (OSError, ValueError):
             return False
 
     def finish(self) -> None:
-        """Flush, and discard what cannot be flushed, or Python would complain when it exits."""
+        """Flush, and discard text that cannot be flushed; else Python reports it at exit."""
         self.flush()
         if self.error is None:
             return
@@ -68,7 +68,7 @@ class TolerantStream:
         return getattr(self._stream, name)
 
     @contextmanager
-    def _noting(self) -> Iterator[None]:
+    def _recording_error(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -78,13 +78,13 @@ class TolerantStream:
 
 
 def tolerate_lost_output() -> tuple[TolerantStream, TolerantStream]:
-    """Make `sys.stdout` and `sys.stderr` tolerant, for good; returns both."""
+    """Replace `sys.stdout` and `sys.stderr` by tolerant streams, permanently; return both."""
     _open_closed_descriptors()
     streams = []
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # its descriptor was closed when Python started
-            stream = Path(os.devnull).open("w")  # noqa: SIM115 (for good)
+            stream = Path(os.devnull).open("w")  # noqa: SIM115 (it stays open)
         if not isinstance(stream, TolerantStream):
             stream = TolerantStream(stream)
         setattr(sys, name, stream)
@@ -94,9 +94,9 @@ def tolerate_lost_output() -> tuple[TolerantStream, TolerantStream]:
 
 @contextmanager
 def tolerant_output() -> Iterator[tuple[TolerantStream, TolerantStream]]:
-    """Make `sys.stdout` and `sys.stderr` tolerant inside the block; yields both.
+    """Replace `sys.stdout` and `sys.stderr` by tolerant streams inside the block; yield both.
 
-    At the end of the block both are flushed.
+    Both are flushed at the end of the block.
     """
     before = sys.stdout, sys.stderr
     streams = tolerate_lost_output()
@@ -112,9 +112,9 @@ def tolerant_output() -> Iterator[tuple[TolerantStream, TolerantStream]]:
 
 
 def _open_closed_descriptors() -> None:
-    """Open the null device in place of standard streams that are closed.
+    """Open the null device on the descriptors of standard streams that are closed.
 
-    Otherwise the next file that is opened takes their place, and receives what libraries print.
+    Otherwise the next opened file gets that descriptor and receives the output of libraries.
     """
     for descriptor in (0, 1, 2):
         try:

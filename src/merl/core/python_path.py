@@ -1,7 +1,7 @@
-"""Keep the working folder out of the module search of Python processes that are started.
+"""Stop child Python processes from importing modules from the working folder.
 
-Libraries start processes by `python -c`, which searches the working folder before the standard
-library. That folder may be the run of a stranger.
+Libraries start processes with `python -c`, which searches the working folder before the standard
+library. That folder may be an untrusted run folder.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from contextlib import contextmanager
 
 _VARIABLE = "PYTHONSAFEPATH"
 _users_values: list[str | None] = []
-"""What the user had set, for each `working_folder_hidden` that is active."""
+"""Earlier values of the variable, one for each active `working_folder_hidden`."""
 
 
 @contextmanager
 def working_folder_hidden() -> Iterator[None]:
-    """Start Python processes that do not look for modules in the working folder."""
+    """Hide the working folder from the module search of processes started in the block."""
     _users_values.append(os.environ.get(_VARIABLE))
     os.environ[_VARIABLE] = "1"
     try:
@@ -27,12 +27,12 @@ def working_folder_hidden() -> Iterator[None]:
 
 
 def users_value() -> str | None:
-    """Return the value that the user has set."""
+    """Return the value that the user has set; None if the variable is not set."""
     return _users_values[0] if _users_values else os.environ.get(_VARIABLE)
 
 
 def set_value(value: str | None) -> None:
-    """Set the variable; None removes it."""
+    """Set `PYTHONSAFEPATH`; None removes it."""
     if value is None:
         os.environ.pop(_VARIABLE, None)
     else:

@@ -1,4 +1,4 @@
-"""What this process may use: memory, threads and disk, and how it holds on to them."""
+"""Memory and disk space that this process may use, and how to reserve them."""
 
 from __future__ import annotations
 
@@ -16,33 +16,35 @@ _ZEROS = bytes(1 << 20)
 
 
 def available_memory(root: Path = Path("/")) -> int:
-    """Memory that this process can still take without swapping or being killed, in bytes.
+    """Return the memory in bytes that this process can still allocate without swapping.
 
-    The smallest of what the machine has available and what each control group around the process
-    (version 1 and 2, with all parents) leaves it. File cache counts as available: the kernel gives
-    it back when asked.
+    The minimum of the available memory of the machine and the remaining memory of each control
+    group (cgroup) of the process, version 1 or 2, including all parent groups. File cache counts as
+    available, since the kernel frees it on demand.
 
     Args:
-        root: where `proc` and `sys` are found; another folder only in tests.
+        root: the folder that contains `proc` and `sys`; other than `/` only in tests.
     """
     return min([_machine_memory(root), *_cgroup_memory(root)])
 
 
 def keep_freed_memory(keep: bool = True) -> bool:
-    """Have the C library keep what is freed for the next tensors, in place of giving it back.
+    """Let the C library keep freed memory for later tensors instead of returning it to the system.
 
-    An update frees and takes the same large blocks every time. By default glibc maps each of them
-    anew, and the system hands out its pages one by one, zeroed: a tenth of the processor time of an
-    update of the paper's size, more where other runs share the machine (docs/bench.md).
+    Every update frees and allocates the same large blocks. By default glibc maps each block anew,
+    and the system provides its pages one by one, filled with zeros. That costs a tenth of the
+    processor time of an update of the paper's size, and more if other runs share the machine
+    (docs/bench.md).
 
     Args:
-        keep: False for what glibc does by itself once it has met large blocks.
+        keep: False restores the values that glibc chooses after large blocks were freed.
 
     Returns:
-        Whether the C library has it: glibc does.
+        Whether the C library supports this; glibc does.
     """
     mmap_threshold, mmap_max, trim_threshold, top_pad = -3, -4, -1, -2  # malloc.h
-    # The thresholds grow to these at the first free of a large block, unless they were ever set.
+    # glibc raises the thresholds to these values when a large block is first freed, unless the
+    # program has set them before.
     grown = {mmap_threshold: 32 << 20, trim_threshold: 64 << 20, top_pad: 128 << 10}
     values = (
         {mmap_max: 0, trim_threshold: -1, top_pad: 64 << 20} if keep else {mmap_max: 65_536} | grown
@@ -55,37 +57,40 @@ def keep_freed_memory(keep: bool = True) -> bool:
 
 
 def free_disk(directory: Path) -> int:
-    """Bytes that this user can write where `directory` lies or will lie."""
+    """Return the bytes that this user can still write on the disk of `directory`.
+
+    The folder does not have to exist yet.
+    """
     status = os.statvfs(existing_parent(directory))
     return status.f_bavail * status.f_frsize
 
 
 def existing_parent(path: Path) -> Path:
-    """The path itself if it exists, else its nearest parent that does."""
+    """Return the absolute path if it exists, else its nearest parent that exists."""
     path = path.absolute()
-    while not _is_there(path):
+    while not _exists(path):
         path = path.parent
     return path
 
 
-def _is_there(path: Path) -> bool:
+def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except OSError:  # too long a name, or a folder that may not be searched
+    except OSError:  # the name is too long, or a folder is not searchable
         return False
 
 
 def reserve_file(path: Path, size: int) -> None:
-    """Make the file at least `size` bytes long, with every new byte backed by the disk.
+    """Extend the file to at least `size` bytes and reserve the disk space of every new byte.
 
-    A file that is only given a length is sparse: writing to its memory map on a full disk kills the
-    process with SIGBUS. New bytes are zero, old ones are kept.
+    A file of which only the length is set is sparse: writing to its memory map on a full disk kills
+    the process with SIGBUS. New bytes are zero; old bytes are kept.
 
     Raises:
-        OSError: the disk is full (ENOSPC), a quota is reached, and the like. The file then has the
-            length that it had before (0 if it is new).
+        OSError: the space cannot be reserved: the disk is full (ENOSPC), a quota is reached, or
+            similar. The file then has the length that it had before (0 if it is new).
     """
-    # Not in append mode: there neither posix_fallocate's emulation nor pwrite keeps to its offset.
+    # Not in append mode: pwrite and the emulation of posix_fallocate would ignore the offset.
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         before = os.fstat(file).st_size
@@ -100,7 +105,7 @@ def reserve_file(path: Path, size: int) -> None:
 
 
 def _allocate(file: int, start: int, end: int) -> None:
-    """Reserve the bytes from `start` to `end`, by writing zeros where nothing better is known."""
+    """Reserve the bytes from `start` to `end`; write zeros if the system has no better way."""
     try:
         os.posix_fallocate(file, start, end - start)
         return
@@ -115,7 +120,7 @@ def _allocate(file: int, start: int, end: int) -> None:
 
 
 def _machine_memory(root: Path) -> int:
-    """MemAvailable where the kernel tells it, else all physical memory."""
+    """Return MemAvailable in bytes if the kernel reports it, else all physical memory."""
     try:
         text = (root / "proc/meminfo").read_text()
     except OSError:
@@ -127,7 +132,7 @@ def _machine_memory(root: Path) -> int:
 
 
 def _cgroup_memory(root: Path) -> Iterator[int]:
-    """What each control group that limits memory has left, in bytes."""
+    """Yield the remaining memory in bytes of each control group with a memory limit."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:
@@ -142,7 +147,7 @@ def _cgroup_memory(root: Path) -> Iterator[int]:
             limit, usage = "memory.limit_in_bytes", "memory.usage_in_bytes"
         else:
             continue
-        # Inside a container the name may be the one outside of it: then only parents exist here.
+        # In a container the group may have its name on the host: then only its parents exist here.
         group = base / name.strip("/")
         for folder in (group, *group.parents):
             if not folder.is_relative_to(base):
@@ -153,7 +158,7 @@ def _cgroup_memory(root: Path) -> Iterator[int]:
 
 
 def _left_in(limit: Path, usage: Path, stat: Path, prefix: str) -> int | None:
-    """Limit minus use plus file cache, in bytes; None where there is no limit or no such group."""
+    """Return limit - usage + file cache in bytes; None without a limit or such a group."""
     try:
         most = limit.read_text().strip()
         used = int(usage.read_text())
@@ -167,9 +172,10 @@ def _left_in(limit: Path, usage: Path, stat: Path, prefix: str) -> int | None:
 
 
 def load_matplotlib() -> None:
-    """Import Matplotlib without the `matplotlibrc` of the working folder, which it reads first.
+    """Import Matplotlib without the `matplotlibrc` of the working folder.
 
-    That folder may be the run of a stranger, and such a file may name programs to start.
+    Matplotlib reads that file first. The folder may be an untrusted run folder, and the file may
+    name programs to start.
     """
     if "matplotlib" in sys.modules or not Path("matplotlibrc").exists():
         return

@@ -1,4 +1,7 @@
-"""Stopping from outside: Ctrl-C, a job's end, a closed terminal."""
+"""Signal handling: signals are deferred until the next safe point.
+
+Signals come from Ctrl-C, from a batch system at the end of a job, or from a closed terminal.
+"""
 
 from __future__ import annotations
 
@@ -15,23 +18,23 @@ from threading import Timer
 from types import FrameType
 
 SHOW_CURSOR = "\x1b[?25h"
-_HEARD = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
-_APART = 0.1
-"""Seconds from which on a second signal is one of its own: `timeout` and batch systems may send the
-same one twice, to the process and to its group."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
+_MIN_INTERVAL = 0.1
+"""Seconds within which a second signal is ignored: `timeout` and batch systems may send one signal
+twice, to the process and to its group."""
 _getsignal, _signal = unwrap(signal.getsignal), unwrap(signal.signal)
-"""Without the conversion to enums, which takes ten times as long."""
+"""The functions without the conversion to enums, which takes ten times as long."""
 _wakeup: list[int] = []
-"""The pipe that Python writes signals to, as long as an `Interrupt` listens."""
+"""Write ends of the pipes that receive signal numbers, one for each listening `Interrupt`."""
 PATIENCE = 3.0
-"""Seconds after which who has asked to stop is told what is waited for."""
+"""Seconds after a signal until the program prints what it waits for."""
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal came where there is nothing to save yet.
+    """A signal arrived before there is anything to save.
 
     Attributes:
-        number: of the signal.
+        number: the signal number.
     """
 
     def __init__(self, number: int) -> None:
@@ -41,32 +44,32 @@ class Stopped(KeyboardInterrupt):
 
 @dataclass
 class Interrupt:
-    """A request to stop, by a signal; a second signal stops at once."""
+    """A request by a signal to stop; a second signal ends the process immediately."""
 
     _number: int | None = None
-    _at: float = 0.0
+    _time: float = 0.0
     _raises: bool = False
-    _telling: Timer | None = None
-    _arrived: int | None = None  # a pipe: the signals that came in, whoever handled them
+    _reminder: Timer | None = None
+    _arrived: int | None = None  # read end of a pipe: all signals, whichever handler received them
 
     @property
     def number(self) -> int | None:
-        """The first signal's number; None as long as there was none."""
+        """Return the number of the first signal; None if no signal has arrived."""
         if self._number is None and self._arrived is not None:
             with suppress(BlockingIOError):
-                heard = [n for n in os.read(self._arrived, 4096) if n in _HEARD]
-                if heard:  # a handler of the environment's took it
-                    self.note(heard[0])
+                arrived = [n for n in os.read(self._arrived, 4096) if n in _SIGNALS]
+                if arrived:  # a handler of the environment received it
+                    self.note(arrived[0])
         return self._number
 
     @contextmanager
     def listening(self) -> Iterator[Interrupt]:
-        """Take SIGINT, SIGTERM, SIGUSR1 and SIGHUP as a request to stop at the next safe point.
+        """Treat SIGINT, SIGTERM, SIGUSR1 and SIGHUP as a request to stop at the next safe point.
 
-        What the process was told to ignore, as `nohup` does, it goes on ignoring.
+        Signals that the process ignores, e.g. because of `nohup`, stay ignored.
         """
-        heard = [number for number in _HEARD if signal.getsignal(number) != signal.SIG_IGN]
-        former = {number: signal.signal(number, self._handle) for number in heard}
+        handled = [number for number in _SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+        former = {number: signal.signal(number, self._handle) for number in handled}
         self._arrived, into = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         former_wakeup = signal.set_wakeup_fd(into, warn_on_full_buffer=False)
         _wakeup.append(into)
@@ -80,24 +83,28 @@ class Interrupt:
             for end in (self._arrived, into):
                 os.close(end)
             self._arrived = None
-            if self._telling is not None:
-                self._telling.cancel()
+            if self._reminder is not None:
+                self._reminder.cancel()
 
     def note(self, number: int) -> None:
-        """Take a signal as the request to stop, if it is the first one."""
+        """Record a signal as the request to stop, if it is the first one.
+
+        Raises:
+            Stopped: inside a `raising` block.
+        """
         if self._number is not None:
             return
-        self._number, self._at = number, time.monotonic()
+        self._number, self._time = number, time.monotonic()
         if self._raises:
             raise Stopped(number)
-        self._telling = Timer(PATIENCE, _tell)
-        self._telling.daemon = True
-        with suppress(RuntimeError):  # no thread can be started: saving matters more
-            self._telling.start()
+        self._reminder = Timer(PATIENCE, _print_reminder)
+        self._reminder.daemon = True
+        with suppress(RuntimeError):  # no thread can be started: saving is more important
+            self._reminder.start()
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Have the first signal raise `Stopped` in here, where no safe point comes for long."""
+        """Make the first signal raise `Stopped` in this block, which has no safe point."""
         self._raises = True
         try:
             yield
@@ -107,40 +114,40 @@ class Interrupt:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self._number is None:
             self.note(number)
-        # A closed terminal sends SIGHUP twice, and saving takes a moment.
-        elif number != signal.SIGHUP and time.monotonic() - self._at > _APART:
-            with suppress(OSError, ValueError):  # the terminal is gone
-                if sys.stdout.isatty():  # the live view hides it
+        # A closed terminal sends SIGHUP twice; the second one must not interrupt saving.
+        elif number != signal.SIGHUP and time.monotonic() - self._time > _MIN_INTERVAL:
+            with suppress(OSError, ValueError):  # the terminal was closed
+                if sys.stdout.isatty():  # the live view hides the cursor
                     os.write(sys.stdout.fileno(), SHOW_CURSOR.encode())
             os._exit(128 + number)
 
 
 class handlers_kept:  # noqa: N801 (a context manager, used like a function)
-    """Put the process's signal handlers back at the end of a call into user code.
+    """Restore the signal handlers of the process at the end of a call into user code.
 
-    They are set without a look at what is there: a library may replace them behind Python's back.
-    Entering and leaving takes some 3 microseconds.
+    The handlers are always set again, since a library may have replaced them without Python knowing
+    it. Entering and leaving takes about 3 microseconds.
     """
 
     def __enter__(self) -> None:
-        """Note the handlers."""
-        self._former = [(number, _getsignal(number)) for number in _HEARD]
+        """Record the handlers."""
+        self._former = [(number, _getsignal(number)) for number in _SIGNALS]
 
     def __exit__(self, *_: object) -> None:
-        """Put them back; only Python's main thread may do so."""
+        """Restore the handlers; only Python's main thread may do so."""
         if threading.current_thread() is threading.main_thread():
             for number, handler in self._former:
-                if handler is not None:  # it is another library's, from before Python's start
+                if handler is not None:  # None: set by another library before Python started
                     _signal(number, handler)
             if _wakeup:
                 signal.set_wakeup_fd(_wakeup[-1], warn_on_full_buffer=False)
 
 
-def _tell() -> None:
-    """A step of the environment, an update or saving takes its time, or will never end."""
+def _print_reminder() -> None:
+    """Print that the run still waits for a step, an update or a save; it may never end."""
     print(
-        "merl: stopping once this step is done and saved; a second signal (Ctrl-C) stops at once, "
-        "back to the last checkpoint",
+        "merl: stopping after this step is done and saved; a second signal (Ctrl-C) stops at once, "
+        "and the steps since the last checkpoint are lost",
         file=sys.stderr,
         flush=True,
     )

@@ -1,4 +1,4 @@
-"""How sure a number is: intervals around a mean and around a rate."""
+"""Confidence intervals of a mean and of a success rate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RESAMPLES = 9_999
 
 
 class Interval(NamedTuple):
-    """An estimate and the interval around it.
+    """An estimate and its confidence interval.
 
     Attributes:
         mean: the estimate.
@@ -28,16 +28,16 @@ class Interval(NamedTuple):
 def bootstrap_interval(
     values: Sequence[float] | NDArray[np.floating], level: float = 0.95, seed: int = 0
 ) -> Interval:
-    """The mean of a sample, with a percentile bootstrap interval.
+    """Return the mean of a sample with its percentile bootstrap interval.
 
-    The percentile form never leaves the range of the sample, and is what the field reports. One
-    value, or values that are all equal, give an interval without width: there is nothing to
-    resample, which is not to say that the mean is known.
+    A percentile interval never exceeds the range of the sample, and it is the common choice in the
+    field. A single value, or equal values, give an interval of width 0, because resampling cannot
+    vary them; this does not mean that the mean is known exactly.
 
     Args:
         values: the sample, at least one number, all finite.
-        level: confidence, in (0, 1).
-        seed: of the resampling; the same seed gives the same interval.
+        level: confidence level, in (0, 1).
+        seed: seed of the resampling; the same seed gives the same interval.
 
     Raises:
         ValueError: an empty sample, a number that is not finite, or a level outside (0, 1).
@@ -45,11 +45,11 @@ def bootstrap_interval(
     _check_level(level)
     sample = np.asarray(values, dtype=np.float64).ravel()
     if sample.size == 0 or not np.isfinite(sample).all():
-        raise ValueError("a bootstrap needs at least one value, and finite ones")
+        raise ValueError("a bootstrap needs at least one value, and all values must be finite")
     mean = float(sample.mean())
     if np.ptp(sample) == 0:
         return Interval(float(sample[0]), float(sample[0]), float(sample[0]))
-    from scipy import stats  # here, for it takes a second to import
+    from scipy import stats  # imported here because it takes a second
 
     low, high = stats.bootstrap(
         (sample,),
@@ -59,27 +59,29 @@ def bootstrap_interval(
         method="percentile",
         rng=np.random.default_rng(seed),
     ).confidence_interval
-    # Of a few values the mean can lie outside a narrow interval; an interval holds its estimate.
+    # With few values the mean can lie outside a narrow interval: extend the interval to the mean.
     return Interval(mean, min(float(low), mean), max(float(high), mean))
 
 
 def wilson_interval(successes: int, n: int, level: float = 0.95) -> Interval:
-    """A rate of success, with Wilson's score interval, which holds for few trials and for 0 or n.
+    """Return a success rate with Wilson's score interval.
+
+    The interval is valid for few trials, and for 0 or n successes.
 
     Args:
-        successes: in [0, n].
-        n: trials, at least 1.
-        level: confidence, in (0, 1).
+        successes: number of successes, in [0, n].
+        n: number of trials, at least 1.
+        level: confidence level, in (0, 1).
 
     Returns:
-        Fractions in [0, 1].
+        The rate and its interval, as fractions in [0, 1].
 
     Raises:
         ValueError: no trials, successes outside [0, n], or a level outside (0, 1).
     """
     _check_level(level)
     if n < 1 or not 0 <= successes <= n:
-        raise ValueError(f"{successes} successes in {n} trials")
+        raise ValueError(f"impossible counts: {successes} successes in {n} trials")
     from scipy import stats
 
     interval = stats.binomtest(int(successes), int(n)).proportion_ci(level, method="wilson")
@@ -88,4 +90,4 @@ def wilson_interval(successes: int, n: int, level: float = 0.95) -> Interval:
 
 def _check_level(level: float) -> None:
     if not 0 < level < 1:
-        raise ValueError(f"a level of confidence lies between 0 and 1, not {level}")
+        raise ValueError(f"the confidence level must be between 0 and 1, not {level}")

@@ -1,7 +1,8 @@
-"""The contracts between the rooms: what flows from the environment to the learner.
+"""Types that the packages of merl share: observation, transition, batch, agent.
 
-Names follow the field: an *observation* is a dict of modalities, a *transition* holds a `discount`
-(0 at a true end, else 1; a time limit bootstraps), a *batch* is what one update learns from.
+An *observation* is a dict of modalities. A *transition* holds a `discount`: 0 if the episode
+terminated, else 1 (after a time limit the value is bootstrapped). A *batch* is the input of one
+update.
 """
 
 from __future__ import annotations
@@ -19,42 +20,42 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Observation = Mapping[str, NDArray[Any]]
-"""One moment as the senses give it, a key per modality: an image is uint8 (H, W, C), a vector
-float32 (n,). Frames are single; stacks are made by the actor and by replay."""
+"""The observation of one timestep, one key per modality: an image is uint8 (H, W, C), a vector
+float32 (n,). It holds single frames; acting and replay stack them."""
 
 FrameTransform = Callable[[int, NDArray[np.uint8], NDArray[np.uint8]], None]
-"""How a stack of frames is taken out of the replay for a batch: told are the sample's number in the
-batch, the frames (K, H, W, C), and where they are to go."""
+"""A function that copies a stack of frames from the replay into a batch, e.g. with a random shift.
+Arguments: the index of the sample in the batch, the frames (K, H, W, C), and the output array."""
 FrameTransforms = Mapping[str, FrameTransform]
-"""By image key."""
+"""A frame transform for each image key."""
 
 CONFIG_FILE = "config.json"
-"""Where a run's folder keeps what was run."""
+"""File in a run folder that holds the config of the run."""
 METRICS_FILE = "metrics.csv"
-"""Where a run's folder keeps its numbers."""
+"""File in a run folder that holds the metrics of the run."""
 
 
 def is_image(space: spaces.Space[Any]) -> bool:
-    """Whether a modality of this space is an image: a uint8 box of shape (H, W, C)."""
+    """Return whether the space is that of an image: a uint8 box of shape (H, W, C)."""
     return space.dtype == np.uint8 and space.shape is not None and len(space.shape) == 3
 
 
 def is_vector(space: spaces.Space[Any]) -> bool:
-    """Whether a modality of this space is a vector: a float box of shape (n,)."""
+    """Return whether the space is that of a vector: a float box of shape (n,)."""
     floats = space.dtype is not None and np.issubdtype(space.dtype, np.floating)
     return bool(floats) and space.shape is not None and len(space.shape) == 1
 
 
 @dataclass(frozen=True)
 class Transition:
-    """What one environment step brought.
+    """One environment transition.
 
     Attributes:
-        action: what was done, float32 (A,), in [-1, 1].
-        reward: what it paid.
-        discount: 0.0 if the episode truly ended here, else 1.0 (a time limit is not an end).
-        observation: what it led to.
-        last: the episode is over, by a true end or a time limit.
+        action: the action taken, float32 (A,), in [-1, 1].
+        reward: the reward of the step.
+        discount: 0.0 if the episode terminated, else 1.0 (also if a time limit truncated it).
+        observation: the observation after the step.
+        last: the episode is over, by termination or truncation.
     """
 
     action: NDArray[np.float32]
@@ -66,16 +67,16 @@ class Transition:
 
 @dataclass(frozen=True)
 class Batch:
-    """What one update learns from: B samples of (o_t, a_t, r_{t:t+n-1}, o_{t+n}).
+    """The input of one update: B samples of (o_t, a_t, r_{t:t+n-1}, o_{t+n}).
 
     Attributes:
         observation: o_t; images uint8 (B, K, H, W, C) with the oldest of the K stacked frames
             first, vectors float32 (B, n).
         action: a_t, float32 (B, A), in [-1, 1].
-        reward: sum of gamma^i r_{t+i} for i < m, float32 (B,); m = n, or less where the episode
-            is over sooner.
-        discount: gamma^m, or 0 where the episode truly ended; float32 (B,).
-        next_observation: o_{t+m}, as `observation`.
+        reward: sum of gamma^i r_{t+i} for i < m, float32 (B,); m = n, or less if the episode ends
+            earlier.
+        discount: gamma^m, or 0 if the episode terminated; float32 (B,).
+        next_observation: o_{t+m}, with the same keys, shapes and types as `observation`.
     """
 
     observation: dict[str, Tensor]
@@ -85,7 +86,7 @@ class Batch:
     next_observation: dict[str, Tensor]
 
     def to(self, device: torch.device) -> Batch:
-        """The same batch on `device`; itself if it is there already."""
+        """Return the batch on `device`; return `self` if it is already there."""
         if self.action.device == device:
             return self
         return Batch(
@@ -98,31 +99,36 @@ class Batch:
 
 
 class Agent(Protocol):
-    """What those who do not know the learner ask of it: acting, evaluating, saving.
+    """Interface of an agent: everything that acting, training, evaluation and saving use.
 
     Attributes:
-        step: environment steps so far, on which exploration may depend; set by who drives it.
+        step: environment steps so far; the training loop sets it, and exploration may depend on it.
     """
 
     step: int
 
     @property
     def senses(self) -> tuple[str, ...]:
-        """The keys of an observation that it acts on."""
+        """Return the observation keys that the policy uses."""
         ...
 
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
-        """Actions (B, A) in [-1, 1] for stacked observations, with exploration noise or without."""
+        """Return actions (B, A) in [-1, 1] for stacked observations.
+
+        Args:
+            observation: images uint8 (B, K, H, W, C), vectors float32 (B, n).
+            explore: whether to add exploration noise.
+        """
         ...
 
     def update(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step on every network; the metrics come back as scalars on the device."""
+        """Make one gradient step on every network; return metrics as scalars on the device."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next update depends on: weights, optimizers, random generators."""
+        """Return all state that updates depend on: weights, optimizers, random generators."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state_dict` gave."""
+        """Restore from `state_dict()`."""
         ...

@@ -19,10 +19,7 @@ from merl.envs.config import EnvConfig
 from merl.envs.user_env import make_user_env
 from merl.evaluation.evaluation import EVALUATION_SEED, Evaluation
 from merl.replay import ReplayConfig
-from merl.runs.run import Run
-from merl.training import trainer
-from merl.training.loop import StepResult
-from merl.training.parts import Parts
+from merl.training.trainer import Trainer
 
 WHOLE, SPLIT, PENDULUM = "merl.envs.dot:whole", "merl.envs.dot:split", "Pendulum-v1"
 Precision = Literal["fp32", "bf16"]
@@ -91,8 +88,8 @@ def small_config(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) 
 def learn(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> Evaluation:
     """Train, and evaluate over 20 episodes without noise; all evaluations are in its metrics."""
     config = small_config(case, seed=seed, run_dir=run_dir, evaluations=evaluations)
-    with Parts.prepare(config, new=True) as parts:
-        outcome = trainer.start(parts, Silent())
+    with Trainer(config) as trainer:
+        outcome = trainer.fit()
     assert outcome.evaluation is not None
     return outcome.evaluation
 
@@ -115,25 +112,3 @@ def returns_of(act: Callable[[Any], Any], task: str, episodes: int = 20) -> list
 def optimum(task: str) -> float:
     """The mean return of going straight to the mark."""
     return float(np.mean(returns_of(lambda env: env.best_action(), task)))
-
-
-class Silent:
-    """Watches and says nothing."""
-
-    def begin(self, run: Run, step: int) -> None:
-        """See `stretch.View`."""
-
-    def moment(self, moment: StepResult, metrics: dict[str, float]) -> None:
-        """See `stretch.View`."""
-
-    def evaluating(self, episode: int, total: int) -> None:
-        """See `stretch.View`."""
-
-    def evaluated(self, step: int, evaluation: Evaluation) -> None:
-        """See `stretch.View`."""
-
-    def saved(self, step: int) -> None:
-        """See `stretch.View`."""
-
-    def warn(self, message: str) -> None:
-        """See `stretch.View`."""

@@ -1,7 +1,7 @@
-"""The loop of Algorithm 1: act, remember, learn.
+"""The loop of Algorithm 1: act, store the transition, learn.
 
-It is a generator that yields after every environment step, so that logging, evaluation and
-checkpoints stay outside, and the same loop serves every agent and every environment.
+The loop is a generator that yields after every environment step: logging, evaluation and
+checkpoints stay outside of it, and the same loop serves every agent and every environment.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from merl.replay import ReplayBuffer
 
 @dataclass
 class Progress:
-    """Where a run stands."""
+    """Counts that a run has reached."""
 
     step: int = 0
     updates: int = 0
     episodes: int = 0
     evaluated: int = 0  # the step of the last evaluation
-    attempts: int = 0  # at the evaluation that is due, which failed or was killed so far
-    restarts: int = 0  # of environments' processes
+    attempts: int = 0  # at the evaluation that is due, all of which failed or were killed
+    restarts: int = 0  # of worker processes
     reports_success: bool = False  # an episode of the environment has reported success or failure
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """What the loop tells after an environment step, or one step of each of several environments.
+    """Result of one step of every environment.
 
-    A run that goes on where updates were left begins with one that tells of those alone.
+    If a resumed run still owes updates, the first result reports only those.
 
     Attributes:
         step: environment steps so far.
         updates: updates so far.
         learning: metrics of the updates at this step, scalars on the device; empty without one.
-        episodes: the sums of the episodes that ended with it.
-        lost: what happened to an environment's process; the episodes in progress are cut off.
+        episodes: the episodes that ended at this step.
+        lost: why a worker process died; the episodes in progress are cut off. None: none died.
     """
 
     step: int
@@ -60,16 +60,16 @@ class StepResult:
 
 
 Update = Callable[[], dict[str, Tensor]]
-"""Makes one update; returns its metrics, scalars on the device."""
+"""Make one update and return its metrics, scalars on the device."""
 
 
 class Randomness:
-    """One seed, split by purpose: no use of one stream moves another.
+    """Random streams from one seed, split by purpose: drawing from one does not affect another.
 
     Attributes:
         agent: the seed of initialisation, noise and shifts.
-        actions: the uniformly random actions of the start.
-        batches: what is sampled from replay.
+        actions: generator of the uniformly random actions at the start.
+        batches: generator of the batches from replay.
     """
 
     def __init__(self, seed: int) -> None:
@@ -93,24 +93,24 @@ class Randomness:
         return seed % 2**31  # many simulators take the seed as a signed 32-bit integer
 
     def on_device(self, updates: int) -> int:
-        """The seed of what is sampled from a replay on a GPU, from so many updates on."""
+        """Return the seed for sampling from a replay on a GPU, starting after `updates` updates."""
         return int(np.random.SeedSequence((self._device, updates)).generate_state(1)[0])
 
     def state_dict(self) -> dict[str, Any]:
-        """The generators' states, as plain types."""
+        """Return the generators' states as plain types."""
         return {
             "actions": self.actions.bit_generator.state,
             "batches": self.batches.bit_generator.state,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state_dict` gave."""
+        """Restore from `state_dict()`."""
         self.actions.bit_generator.state = state["actions"]
         self.batches.bit_generator.state = state["batches"]
 
 
 def train(
-    stage: Collector,
+    collector: Collector,
     agent: Agent,
     update: Update,
     progress: Progress,
@@ -118,28 +118,29 @@ def train(
     config: TrainConfig,
     is_to_stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[StepResult]:
-    """Act and learn until `config.steps`; yields after each step of the environments.
+    """Act and learn until `config.steps`; yield after each step of the environments.
 
     Args:
-        stage: where the agent acts, and what remembers it; its environments are seeded by this loop
-            if the run begins, and stand where the caller set them if it goes on.
-        agent: acts.
-        update: has it learn from what is remembered.
-        progress: moved on as the run goes.
+        collector: acts and fills the replay. The loop seeds its environments if the run is new; the
+            caller has restored them if it is resumed.
+        agent: chooses actions.
+        update: lets the agent learn from the replay.
+        progress: counts, which the loop advances.
         randomness: the run's random streams.
         config: steps, seed steps, random steps, updates per step, batch size.
-        is_to_stop: whether updates that are due are to be left for when the run goes on; not asked
-            beside the environments, where what is left would be learnt from more than was there.
+        is_to_stop: return whether to leave the updates that are due to the resumed run. Ignored if
+            environments run beside the learner: the resumed run would make those updates from a
+            fuller replay.
 
     Raises:
-        NotFinite: an observation or a reward is no number; the replay does not take it in.
+        NotFinite: an observation or a reward is NaN or infinite; it does not enter the replay.
     """
     if progress.episodes == 0:
-        stage.seed(randomness, progress)
+        collector.seed(randomness, progress)
     stopping = is_to_stop if config.synchronous else lambda: False
     learn = partial(_learn, update, progress, config, stopping)
-    # What was left when it was stopped, at the step that it was due at.
-    agent.step = max(0, progress.step - config.action_repeat * stage.count)
+    # First the updates that were due when the run was stopped.
+    agent.step = max(0, progress.step - config.action_repeat * collector.count)
     left = learn() if config.synchronous else {}
     if left or stopping():
         yield StepResult(progress.step, progress.updates, left)
@@ -147,20 +148,20 @@ def train(
         agent.step = progress.step
         learning: dict[str, Tensor] = {}
         try:
-            stage.begin_episodes(randomness, progress)
-            actions = _actions(stage, agent, progress, randomness, config)
-            # Beside the environments the learner learns while they step. A GPU is told what to
-            # learn before its actions are waited for, lest it stand idle until they have arrived.
-            told = actions.under_way and not config.synchronous
-            if told:
+            collector.begin_episodes(randomness, progress)
+            actions = _actions(collector, agent, progress, randomness, config)
+            # Without `synchronous` the learner learns while the environments step. On a GPU launch
+            # the updates before waiting for the actions, so that it never idles.
+            launched = actions.under_way and not config.synchronous
+            if launched:
                 learning = learn()
-            stage.act(actions.wait().numpy())
-            if not (told or config.synchronous):
+            collector.act(actions.wait().numpy())
+            if not (launched or config.synchronous):
                 learning = learn()
-            ended = stage.remember(progress, config.action_repeat)
-        except WorkerDied as lost:
-            stage.broken = True
-            yield StepResult(progress.step, progress.updates, learning, lost=str(lost))
+            ended = collector.store(progress, config.action_repeat)
+        except WorkerDied as died:
+            collector.broken = True
+            yield StepResult(progress.step, progress.updates, learning, lost=str(died))
             continue
         if config.synchronous or progress.step >= config.steps:
             learning = learn() or learning
@@ -169,15 +170,15 @@ def train(
 
 
 class Collector:
-    """The environments that the agent acts in, with the stacks that it sees, and the replay.
+    """Steps the environments and stores the transitions.
 
     Args:
         environments: one or several.
-        replay: a ring for each.
-        stacks: of each one's frames.
+        replay: has a ring for each environment.
+        stacks: the frame stack of each environment.
 
     Attributes:
-        broken: an environment's process was lost; all are made anew before the next episode.
+        broken: a worker process died; restart all before the next episode.
     """
 
     def __init__(
@@ -191,17 +192,17 @@ class Collector:
 
     @property
     def count(self) -> int:
-        """How many environments there are."""
+        """Return the number of environments."""
         return self.environments.count
 
     def seed(self, randomness: Randomness, progress: Progress) -> None:
-        """Have the next episode of each environment begin with a seed of the run's."""
+        """Seed the next episode of each environment from the run's seed."""
         self._seeds = {
             index: randomness.environment(index, progress.restarts) for index in range(self.count)
         }
 
     def begin_episodes(self, randomness: Randomness, progress: Progress) -> None:
-        """Start an episode in every environment that is in none."""
+        """Start an episode in every environment that has none in progress."""
         if self.broken:
             progress.restarts += 1
             self._episodes.clear()  # the replay cuts them off where the next ones begin
@@ -222,12 +223,12 @@ class Collector:
             self._episodes[index] = Episode()
 
     def act(self, actions: NDArray[np.float32]) -> None:
-        """Have the environments step, with actions (count, A)."""
+        """Start a step of the environments with actions (count, A)."""
         self._actions = actions
         self.environments.send(actions)
 
-    def remember(self, progress: Progress, repeat: int) -> tuple[Episode, ...]:
-        """Take in what the actions led to; returns the episodes that it ended."""
+    def store(self, progress: Progress, repeat: int) -> tuple[Episode, ...]:
+        """Wait for the step and store its transitions; return the episodes that ended."""
         assert self._actions is not None
         ended = []
         for index, step in enumerate(self.environments.receive()):
@@ -246,30 +247,34 @@ class Collector:
         return tuple(ended)
 
     def _where(self, index: int) -> str:
-        """Which environment, where there are several; the first is number 0."""
+        """Name the environment in an error message, if there are several."""
         return f"of environment {index}" if self.count > 1 else ""
 
 
 def _actions(
-    stage: Collector, agent: Agent, progress: Progress, randomness: Randomness, config: TrainConfig
+    collector: Collector,
+    agent: Agent,
+    progress: Progress,
+    randomness: Randomness,
+    config: TrainConfig,
 ) -> Fetched:
-    """Uniformly random at first, then the agent's: (count, A) in [-1, 1]."""
+    """Choose actions, (count, A) in [-1, 1]: uniformly random at first, then the agent's."""
     if progress.step < config.random_steps:
-        shape = (stage.count, *stage.environments.action_shape)
+        shape = (collector.count, *collector.environments.action_shape)
         drawn = randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
         return Fetched(torch.from_numpy(drawn))
-    return Fetched(agent.act(side_by_side(stage.stacks), explore=True).float())
+    return Fetched(agent.act(side_by_side(collector.stacks), explore=True).float())
 
 
 def updates_due(steps: int, updates_per_step: float) -> int:
-    """How many updates so many steps ask for, exactly: 0.57 is meant, not the float nearest it."""
+    """Return how many updates are due after these steps, exact in decimals (0.57 is 57/100)."""
     return int(steps * Fraction(str(updates_per_step)))
 
 
 def _learn(
     update: Update, progress: Progress, config: TrainConfig, is_to_stop: Callable[[], bool]
 ) -> dict[str, Tensor]:
-    """The updates that are due: after t steps, (t - seed_steps) updates_per_step in all."""
+    """Make the updates that are due: after t steps, (t - seed_steps) * updates_per_step in all."""
     due = updates_due(progress.step - config.seed_steps, config.updates_per_step)
     metrics: dict[str, Tensor] = {}
     while progress.updates < due and not is_to_stop():

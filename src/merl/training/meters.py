@@ -1,4 +1,4 @@
-"""What a run counts about itself: time, rates, and the means of what the learner tells."""
+"""Meters of a run: time, rates, means of the learner's metrics, and when to save."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from merl.training.loop import Progress
 
 
 class Averages:
-    """Means of the learner's metrics since they were last taken; on the device until then."""
+    """Means of the learner's metrics since the last `take`; on the device until then."""
 
     def __init__(self) -> None:
         self._sums: dict[str, Tensor] = {}
@@ -25,46 +25,46 @@ class Averages:
         self._counts.update(metrics.keys())
 
     def take(self) -> dict[str, float]:
-        """The means, and begin anew."""
+        """Return the means, and start again."""
         means = {f"learn/{name}": float(s) / self._counts[name] for name, s in self._sums.items()}
         self._sums, self._counts = {}, Counter()
         return means
 
 
 class Clock:
-    """Time of training across interruptions, and rates since they were last taken.
+    """Time of training across interruptions, and rates since the last mark.
 
-    Beside the wall's clock it keeps the processor's, of all threads together: on a machine that is
-    shared, the one that can be compared.
-
-    Args:
-        seconds: on the wall's clock, when the run was last left.
-        cpu_seconds: on the processor's.
+    It counts wall-clock time and the processor time of all threads: on a shared machine only the
+    latter can be compared.
     """
 
-    def __init__(self, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
-        self._before, self._cpu_before = seconds, cpu_seconds
-        self._start, self._cpu_start = time.perf_counter(), time.process_time()
+    def __init__(self) -> None:
+        self.restore(0.0, 0.0)
         self._mark = (0.0, 0, 0)
 
+    def restore(self, seconds: float, cpu_seconds: float) -> None:
+        """Continue from the wall-clock and processor time of a checkpoint, in seconds."""
+        self._before, self._cpu_before = seconds, cpu_seconds
+        self._start, self._cpu_start = time.perf_counter(), time.process_time()
+
     def seconds(self) -> float:
-        """Since the run began, time away not counted."""
+        """Return the wall-clock time of training since the run began, without interruptions."""
         return self._before + self.stretch()
 
     def cpu_seconds(self) -> float:
-        """Processor time since the run began."""
+        """Return the processor time of training since the run began."""
         return self._cpu_before + time.process_time() - self._cpu_start
 
     def stretch(self) -> float:
-        """Seconds since the run began or was gone on with."""
+        """Return the seconds since start or resume."""
         return time.perf_counter() - self._start
 
     def mark(self, progress: Progress) -> None:
-        """Have the next rates count from here."""
+        """Measure the next rates from here."""
         self._mark = (self.stretch(), progress.step, progress.updates)
 
     def rates(self, progress: Progress) -> dict[str, float]:
-        """The time, and steps and updates per second since the last mark; sets a mark."""
+        """Return the time, and steps and updates per second since the last mark; set a mark."""
         then, steps, updates = self._mark
         self.mark(progress)
         span = max(self.stretch() - then, 1e-9)
@@ -77,15 +77,15 @@ class Clock:
 
 
 class Interval:
-    """When to save: at an episode's end, or within one that takes much longer than usual.
+    """When to save: at the end of an episode, or within one that takes much longer than usual.
 
     Args:
-        seconds: that may lie between two saves.
-        now: tells the time, in seconds.
+        seconds: allowed between two saves.
+        now: returns the time, in seconds.
     """
 
     LEAST = 5.0
-    """Seconds: a shorter interval does not make saves within an episode more frequent."""
+    """Seconds: a shorter interval does not cause more saves within episodes."""
 
     def __init__(self, seconds: float, now: Callable[[], float] = time.perf_counter) -> None:
         self._seconds, self._now = seconds, now
@@ -94,23 +94,23 @@ class Interval:
         self._within = False  # the last save was within an episode
 
     def is_due(self) -> bool:
-        """At a chance to save: whether the next one, as far away as the last, would be too late."""
+        """Return, at the end of an episode, whether waiting for the next end would be too late."""
         now = self._now()
         apart, self._chance = now - self._chance, now
         self._longest = max(self._longest, apart)
-        # A run resumes exactly only from an episode's end: a save within one is soon replaced.
+        # A run resumes exactly only from an episode's end: replace a save within one soon.
         return self._within or now + apart - self._saved > self._seconds
 
     def is_overdue(self) -> bool:
-        """Within an episode: whether its end is too late to wait for with the next save."""
+        """Return, within an episode, whether waiting for its end would be too late."""
         patience = 2 * max(self._seconds, self.LEAST) + 3 * self._longest
         return self._now() - self._saved > patience
 
     def saved(self, within: bool = False) -> None:
-        """Count from here: a save is done, or was tried.
+        """Restart the count after a save, or after an attempt.
 
         Args:
-            within: it was within an episode.
+            within: the save was within an episode.
         """
         self._saved, self._within = self._now(), within
         if not within:

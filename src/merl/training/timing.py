@@ -1,7 +1,7 @@
-"""What this machine needs for an update and for a step: measured once, before a run begins.
+"""Time an update and a step on this machine, once, before a run begins.
 
-Updates and acting are timed with synthetic observations. A user's own environment is only
-timed if `TrainConfig.measure` is set: it may be a robot, which must not move before the run begins.
+Updates and acting are timed with synthetic observations. A user's own environment is timed only if
+`TrainConfig.measure` is set: it may be a robot, which must not move before the run begins.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from merl.training.updating import Recorded
 
 REPEATS = 3
 REPEATS_ON_GPU = 30
-"""Of an update there, which takes a few milliseconds."""
+"""Repeats of an update on a GPU, where it takes a few milliseconds."""
 MEASURED_STEPS = 25
 THREADS_PAY = 1.3
-"""How many times faster several threads must be than one to be chosen. They wait for each other at
-every operation: once another process takes a core, they can become ten times slower than one."""
+"""How many times faster several threads must be than one to be chosen. They wait for each other in
+every operation: if another process takes a core, they can become ten times slower than one."""
 BF16_PAYS = 1.1
-"""How many times faster than in fp32 an update must be in bf16 for that to be chosen: where the two
-are alike, the same command is to give the same run."""
+"""How many times faster than fp32 an update must be in bf16 for bf16 to be chosen: where both are
+equally fast, the same command should give the same run."""
 WORTH_COMPILING = 1800.0
-"""Seconds that a run must take for a compiled update to be tried, which takes a minute or two."""
+"""Seconds that a run must take before a compiled update is tried, which takes a minute or two."""
 
 
 @dataclass(frozen=True)
@@ -57,26 +57,26 @@ class Arithmetic:
 
     @property
     def must_gain(self) -> float:
-        """By which factor it must be faster than strict fp32 on one thread to be chosen."""
+        """Return how many times faster than fp32 on one thread it must be to be chosen."""
         precision = BF16_PAYS if self.precision == "bf16" else 1.0
         return precision * (THREADS_PAY if self.threads > 1 else 1.0)
 
     def decided(self, config: AgentConfig) -> AgentConfig:
-        """A config with what it may have left open."""
+        """Return the config with precision and compilation decided."""
         torch_compile: Literal["yes", "no"] = "yes" if self.compiled else "no"
         return dataclasses.replace(config, precision=self.precision, torch_compile=torch_compile)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds, as measured.
+    """Measured times, in seconds.
 
     Attributes:
-        update: of one update, for each way that was tried.
-        step: of acting and one step of the run's environment, picture included; where actions are
-            held, that is one decision.
-        frame: of one picture of a video; 0 where none is made.
-        not_compiled: why updates cannot be compiled, where that was tried.
+        update: of one update, for each arithmetic that was tried.
+        step: of acting and one step of the run's environment, with its images; with
+            `action_repeat`, of one action.
+        frame: of one frame of a video; 0 without videos.
+        not_compiled: why updates cannot be compiled, if that was tried.
         knows_env: whether `step` includes the environment's step; if not, it is acting alone.
     """
 
@@ -88,11 +88,11 @@ class Timing:
 
     @property
     def best(self) -> Arithmetic:
-        """The fastest way to compute updates; bf16 and more threads only where they clearly pay."""
+        """Return the fastest arithmetic; bf16 and more threads only if they are clearly faster."""
         return min(self.update, key=lambda how: self.update[how] * how.must_gain)
 
     def seconds(self, config: TrainConfig, done: int = 0) -> float:
-        """Return the time that a run takes from step `done` on, evaluation included.
+        """Return the time that a run takes from step `done` on, evaluations included.
 
         Without the environment's step (`knows_env`) this is a lower bound.
         """
@@ -101,7 +101,7 @@ class Timing:
         updates = (config.steps - max(done, config.seed_steps)) * config.updates_per_step
         count = config.eval.count(steps)
         evaluations = count * config.eval.episodes
-        length = 250 / repeat  # decisions of an episode, near enough for an estimate
+        length = 250 / repeat  # actions of an episode, roughly
         videos = {"each": count, "last": min(1, count), "none": 0}[config.eval.video]
         whole = max(0.0, updates) * self.update[self.best] + videos * length * self.frame
         whole += (steps / repeat + evaluations * length) * self.step
@@ -115,13 +115,13 @@ def measure(
     space: spaces.Dict,
     device: torch.device,
 ) -> Timing:
-    """Time the update in every way that the config leaves open, and the environment's step.
+    """Time the update in every arithmetic that the config leaves open, and the environment's step.
 
-    Precision first, on one thread; then the fastest on all threads, or on a GPU compiled. A
-    user's own environments are only touched if `config.measure` is set.
+    Try the precisions on one thread, then the faster one on all threads, or compiled on a GPU. Do
+    not touch a user's own environments unless `config.measure` is set.
 
     Raises:
-        MerlError: the update is to be compiled, and cannot be.
+        MerlError: the config asks for a compiled update, and compilation fails.
     """
     asked, cores = config.agent.precision, len(os.sched_getaffinity(0))
     threads = config.threads or (cores if device.type == "cuda" else 1)
@@ -171,7 +171,7 @@ def measure(
 
 
 def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -> bool:
-    """Whether a compiled update is to be tried: on a GPU, for a long run, where that is left open.
+    """Return whether to try a compiled update: on a GPU, for a long run, if the config allows it.
 
     On a CPU it was never faster (docs/bench.md).
     """
@@ -180,12 +180,12 @@ def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -
 
 
 def use_threads(count: int) -> None:
-    """Let updates of this process take `count` threads."""
+    """Use `count` processor threads in this process."""
     torch.set_num_threads(count)
 
 
 def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:
-    """A batch such as replay would give, of noise: always the same for the same config."""
+    """Return a batch of noise in the form of a replay batch, the same for the same config."""
     generator = torch.Generator().manual_seed(0)
     size, stack = config.replay.batch_size, config.replay.frame_stack
 
@@ -228,11 +228,11 @@ def _agent(
 def _time_update(agent: DDPG, batch: Batch) -> float:
     make: Update = partial(agent.update, batch)
     first, repeats = 1, REPEATS  # the first one sets up what the others use
-    if agent.device.type == "cuda":  # where training records it
+    if agent.device.type == "cuda":  # as training does there
         there = batch.to(agent.device)
         make, first, repeats = Recorded(agent, lambda: there), Recorded.WARM_UP + 1, REPEATS_ON_GPU
 
-    # Some updates leave the actor out: a whole cycle of them is timed.
+    # Not every update moves the actor: time a whole cycle of updates.
     cycle = agent.config.actor_every
 
     def updates() -> None:
@@ -246,7 +246,7 @@ def _time_update(agent: DDPG, batch: Batch) -> float:
 
 
 class _CompileError(MerlError):
-    """What torch makes of an update does not run here."""
+    """The compiled update does not run on this machine."""
 
     def __init__(self, error: Exception) -> None:
         self.reason = (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -12,8 +12,8 @@ from rich.console import Console
 from helpers import flat
 from merl.acting.rollout import Episode
 from merl.evaluation.evaluation import Evaluation, summarize
-from merl.training import console as console_module
-from merl.training.console import ConsoleView, describe, sparkline
+from merl.training import live_view
+from merl.training.live_view import LiveView, describe, sparkline
 from merl.training.loop import StepResult
 
 METRICS = {
@@ -41,7 +41,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The view's clock, which stands still until a test moves it."""
     clock = Clock()
-    monkeypatch.setattr(console_module.time, "perf_counter", clock)
+    monkeypatch.setattr(live_view.time, "perf_counter", clock)
     return clock
 
 
@@ -65,6 +65,17 @@ def new_run(steps: int = 1000, minutes: float | None = None, path: Path = Path("
     return SimpleNamespace(config=config, path=path)
 
 
+def trainer_of(run: Any, step: int) -> Any:
+    setup = SimpleNamespace(progress=SimpleNamespace(step=step))
+    return SimpleNamespace(run=run, setup=setup)
+
+
+def show_step(view: LiveView, result: StepResult, metrics: dict[str, float]) -> None:
+    view.on_step(result)
+    if metrics:
+        view.on_episode(result.step, metrics)
+
+
 def console_of(terminal: bool, width: int = 100, encoding: str = "utf-8") -> Console:
     file = io.TextIOWrapper(io.BytesIO(), encoding=encoding, write_through=True)
     return Console(
@@ -77,7 +88,7 @@ def text_of(console: Console) -> str:
     return file.buffer.getvalue().decode(file.encoding)
 
 
-def drawn(view: ConsoleView) -> str:
+def drawn(view: LiveView) -> str:
     """What the live table shows now, with single spaces."""
     with view.console.capture() as capture:
         view.console.print(view._draw())
@@ -86,15 +97,16 @@ def drawn(view: ConsoleView) -> str:
 
 def watch(terminal: bool, width: int = 100, encoding: str = "utf-8") -> str:
     console = console_of(terminal, width, encoding)
-    with ConsoleView(console, SCALE) as view:
-        view.begin(new_run(), 0)
-        for step in range(1, 251):
-            view.moment(StepResult(step, step), METRICS if step == 250 else {})
-        view.evaluating(0, 2)
-        view.evaluated(250, summarize(episodes()))
-        view.evaluated(251, evaluation_of(219.4))
-        view.warn("the disk is full")
-        view.saved(250)
+    view = LiveView(console, SCALE)
+    view.on_start(trainer_of(new_run(), 0))
+    for step in range(1, 251):
+        show_step(view, StepResult(step, step), METRICS if step == 250 else {})
+    view.on_evaluation_step(0, 2)
+    view.on_evaluation(250, summarize(episodes()))
+    view.on_evaluation(251, evaluation_of(219.4))
+    view.on_warning("the disk is full")
+    view.on_checkpoint(250)
+    view.on_end(None)
     return text_of(console)
 
 
@@ -129,11 +141,11 @@ def test_a_terminal_that_knows_ascii_alone_is_shown_ascii_alone() -> None:
 
 def test_plain_lines_come_at_intervals_with_position_and_speed(clock: Clock) -> None:
     console = console_of(terminal=False)
-    with ConsoleView(console) as view:
-        view.begin(new_run(minutes=10.0), 0)
-        for step, seconds in ((200, 10.0), (300, 25.0), (400, 31.0), (450, 40.0)):
-            clock.seconds = 100.0 + seconds
-            view.moment(StepResult(step, step - 100), METRICS)
+    view = LiveView(console)
+    view.on_start(trainer_of(new_run(minutes=10.0), 0))
+    for step, seconds in ((200, 10.0), (300, 25.0), (400, 31.0), (450, 40.0)):
+        clock.seconds = 100.0 + seconds
+        show_step(view, StepResult(step, step - 100), METRICS)
     (line,) = text_of(console).splitlines()
     assert line.startswith("00:31 of 10:00, or step 400 of 1,000 (40%, 01:03 left): training")
     assert line.endswith("noise); 33 steps/s, 17 updates/s")
@@ -151,9 +163,9 @@ def test_plain_lines_come_at_intervals_with_position_and_speed(clock: Clock) -> 
 def test_the_bar_runs_to_the_limit_that_is_reached_first(
     minutes: float | None, step: int, seconds: float, percent: str, clock: Clock
 ) -> None:
-    view = ConsoleView(console_of(terminal=False))
-    view.begin(new_run(minutes=minutes), 0)
-    view.moment(StepResult(step, 0), {})
+    view = LiveView(console_of(terminal=False))
+    view.on_start(trainer_of(new_run(minutes=minutes), 0))
+    show_step(view, StepResult(step, 0), {})
     clock.seconds += seconds
     shown = drawn(view)
     assert shown.startswith(f"{percent} ")
@@ -163,56 +175,56 @@ def test_the_bar_runs_to_the_limit_that_is_reached_first(
 
 def test_the_time_left_is_of_the_pace_with_updates(clock: Clock) -> None:
     """Steps without updates are much faster: an estimate from them would be far too short."""
-    view = ConsoleView(console_of(terminal=False))
-    view.begin(new_run(), 0)
+    view = LiveView(console_of(terminal=False))
+    view.on_start(trainer_of(new_run(), 0))
     clock.seconds += 10.0
-    view.moment(StepResult(100, 0), {})
+    show_step(view, StepResult(100, 0), {})
     assert "left" not in drawn(view)
-    view.moment(StepResult(101, 1), {})
+    show_step(view, StepResult(101, 1), {})
     clock.seconds += 100.0
-    view.moment(StepResult(201, 101), {})  # a step a second
+    show_step(view, StepResult(201, 101), {})  # a step a second
     assert "13:19 left" in drawn(view)
     clock.seconds += 800.0
-    view.moment(StepResult(1000, 900), {})
+    show_step(view, StepResult(1000, 900), {})
     assert "left" not in drawn(view)
 
 
 def test_a_return_below_random_actions_is_explained() -> None:
-    view = ConsoleView(console_of(terminal=False), SCALE)
-    view.begin(new_run(), 0)
+    view = LiveView(console_of(terminal=False), SCALE)
+    view.on_start(trainer_of(new_run(), 0))
     assert "compare with random actions 7.8, scripted expert 219.4" in drawn(view)
     assert "below" not in drawn(view)
-    view.moment(StepResult(50, 0), METRICS | {"train/return": 0.0})
+    show_step(view, StepResult(50, 0), METRICS | {"train/return": 0.0})
     shown = drawn(view)
     assert "return 0.0" in shown
     assert "learning begins at step 100" in shown
     assert "at first an agent is often below random actions" in shown
-    view.evaluated(250, evaluation_of(100.0))
+    view.on_evaluation(250, evaluation_of(100.0))
     assert "below" not in drawn(view)
 
 
 def test_before_the_first_evaluation_its_step_is_shown() -> None:
-    view = ConsoleView(console_of(terminal=False))
-    view.begin(new_run(), 0)
+    view = LiveView(console_of(terminal=False))
+    view.on_start(trainer_of(new_run(), 0))
     shown = drawn(view)
     assert "evaluation the first one after step 250, or at the end" in shown
     assert "compare with" not in shown  # nothing is known
 
 
 def test_a_training_episode_without_success_counts_as_failed() -> None:
-    view = ConsoleView(console_of(terminal=False))
-    view.begin(new_run(), 0)
+    view = LiveView(console_of(terminal=False))
+    view.on_start(trainer_of(new_run(), 0))
     silent = {name: value for name, value in METRICS.items() if "success" not in name}
     for step, metrics in enumerate((METRICS, silent, silent, silent)):
-        view.moment(StepResult(step, 0), metrics)
+        show_step(view, StepResult(step, 0), metrics)
     assert "success 25%" in drawn(view)
 
 
 def test_a_resumed_run_shows_its_earlier_evaluations(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("step,train/return,eval/return\n10,1,\n20,2,0.0\n")
-    view = ConsoleView(console_of(terminal=False))
-    view.begin(new_run(path=tmp_path), 20)
-    view.evaluated(30, evaluation_of(5.0))
+    view = LiveView(console_of(terminal=False))
+    view.on_start(trainer_of(new_run(path=tmp_path), 20))
+    view.on_evaluation(30, evaluation_of(5.0))
     assert "evaluations ▁█ (scale: 0.0 to 5.0)" in drawn(view)
 
 

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from statistics import mean
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console, Group
@@ -19,7 +20,11 @@ from rich.text import Text
 from merl.core import METRICS_FILE, counted
 from merl.evaluation.evaluation import Evaluation
 from merl.runs.run import Run
+from merl.training.callbacks import Callback
 from merl.training.loop import StepResult
+
+if TYPE_CHECKING:
+    from merl.training.trainer import Outcome, Trainer
 
 RECENT = 10
 """Training episodes over which the shown means are taken."""
@@ -31,13 +36,13 @@ SPARK_WIDTH = 40
 """Characters of a sparkline; more values than that are averaged."""
 
 
-class ConsoleView:
+class LiveView(Callback):
     """Shows a run as a live table on a terminal, and as plain lines elsewhere.
 
     Args:
         console: where to print.
-        scale: name -> return of what the agent's returns are compared with, from the lowest to the
-            highest, e.g. random actions and an expert; empty if unknown.
+        scale: {name: return} of references, from the lowest to the highest, e.g. random actions and
+            an expert; empty if unknown.
     """
 
     def __init__(self, console: Console, scale: Mapping[str, float] | None = None) -> None:
@@ -45,33 +50,29 @@ class ConsoleView:
         self._scale = dict(scale or {})
         self._is_live = console.is_interactive
         self._speed = self._training = self._learner = self._evaluation = self._note = ""
-        self._recent: deque[dict[str, float]] = deque(maxlen=RECENT)
+        self._recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
         self._returns: list[float] = []  # of all evaluations
         self._training_return: float | None = None  # of the last episode
-        self._step = self._total = self._learning_starts = 0
+        self._step = self._updates = self._total = self._learning_starts = 0
         self._minutes: float | None = None
         self._start = self._printed = time.perf_counter()
         self._learning_since: tuple[float, int] | None = None  # time and step of the first update
-        # Rich draws in a thread of its own: what it shows is replaced, never changed in place.
+        # Rich draws in another thread: replace values, never change them in place.
         self._live = Live(
             console=console, refresh_per_second=4, transient=False, get_renderable=self._draw
         )
 
-    def __enter__(self) -> ConsoleView:
-        """Return the view; it draws once training begins."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def on_end(self, outcome: Outcome | None) -> None:
         """Leave the last drawing on the terminal."""
         if self._live.is_started:
             self._live.refresh()
             self._live.stop()
 
-    def begin(self, run: Run, step: int) -> None:
-        """Start to show a run that begins, or resumes, at `step`."""
-        config = run.config
+    def on_start(self, trainer: Trainer) -> None:
+        """Start to show the run."""
+        run, config = trainer.run, trainer.run.config
         self._total, self._minutes = config.steps, config.minutes
-        self._step = step
+        self._step = trainer.setup.progress.step
         self._learning_starts = config.seed_steps
         self._returns = _earlier_returns(run)
         every = config.eval.every
@@ -82,16 +83,18 @@ class ConsoleView:
         elif self._scale:
             self._print(f"returns to compare with: {self._compared()}")
 
-    def moment(self, moment: StepResult, metrics: dict[str, float]) -> None:
-        """Show an environment step; `metrics` is empty unless an episode ended."""
-        self._step = moment.step
-        if self._learning_since is None and moment.updates:
-            self._learning_since = time.perf_counter(), moment.step
-        if not metrics:
-            return
+    def on_step(self, result: StepResult) -> bool | None:
+        """Show an environment step."""
+        self._step, self._updates = result.step, result.updates
+        if self._learning_since is None and result.updates:
+            self._learning_since = time.perf_counter(), result.step
+        return None
+
+    def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Show the metrics of an episode."""
         self._recent.append(metrics)
         self._training_return = metrics["train/return"]
-        self._training = self._recent_training(moment.updates)
+        self._training = self._recent_training()
         self._speed = (
             f"{metrics['time/steps_per_second']:.0f} steps/s, "
             f"{metrics['time/updates_per_second']:.0f} updates/s"
@@ -108,11 +111,11 @@ class ConsoleView:
                 f"training {self._training}; {self._speed}"
             )
 
-    def evaluating(self, episode: int, total: int) -> None:
+    def on_evaluation_step(self, episode: int, total: int) -> None:
         """Show that an evaluation is in episode `episode` (from 0) of `total`."""
         self._note = f"evaluating: episode {episode + 1} of {total}"
 
-    def evaluated(self, step: int, evaluation: Evaluation) -> None:
+    def on_evaluation(self, step: int, evaluation: Evaluation) -> None:
         """Show the result of an evaluation."""
         self._note = ""
         self._returns = [*self._returns, evaluation.returns.mean]
@@ -122,19 +125,19 @@ class ConsoleView:
             if len(self._returns) > 1:
                 self._print(f"returns of all evaluations: {self._sparkline()}")
 
-    def saved(self, step: int) -> None:
+    def on_checkpoint(self, step: int) -> None:
         """Show that a checkpoint was written."""
         self._note = f"saved at step {step:,}"
 
-    def warn(self, message: str) -> None:
-        """Print what the user should know."""
+    def on_warning(self, message: str) -> None:
+        """Print a warning."""
         self.console.print(f"warning: {message}", style="yellow", markup=False, soft_wrap=True)
 
     def _print(self, line: str) -> None:
         self.console.print(line, highlight=False, soft_wrap=True)
 
     def _draw(self) -> Group:
-        """The live table."""
+        """Return the live table."""
         bar = Table.grid(padding=(0, 1), expand=True)
         bar.add_column()
         bar.add_column(ratio=1)
@@ -157,7 +160,7 @@ class ConsoleView:
         return Group(bar, table, Text(self._note, style="dim"))
 
     def _position(self) -> str:
-        """The steps so far, and the minutes where they are limited."""
+        """Return the steps so far, and the minutes if they are limited."""
         steps = f"step {self._step:,} of {self._total:,}"
         if self._minutes is None:
             return steps
@@ -166,7 +169,7 @@ class ConsoleView:
         return f"{_clock(passed)} of {_clock(limit)}, or {steps}"
 
     def _fraction(self) -> float:
-        """How much of the run is done, by the limit that is reached first: steps or minutes."""
+        """Return the fraction done, by the limit that is reached first: steps or minutes."""
         fraction = self._step / max(self._total, 1)
         if self._minutes is not None:
             passed = time.perf_counter() - self._start
@@ -174,9 +177,9 @@ class ConsoleView:
         return min(fraction, 1.0)
 
     def _time_left(self) -> str:
-        """An estimate, by the limit that is reached first; empty while there is none.
+        """Estimate the time to the limit that is reached first; empty while unknown.
 
-        Steps before the first update are much faster: the pace is that of the steps after it.
+        Steps before the first update are much faster: use only the pace after it.
         """
         now, estimates = time.perf_counter(), []
         if self._minutes is not None:
@@ -188,32 +191,32 @@ class ConsoleView:
         left = min(estimates, default=0.0)
         return f"{_clock(left)} left" if left > 0 else ""
 
-    def _recent_training(self, updates: int) -> str:
-        """Return and success of the last training episodes, which include exploration noise."""
+    def _recent_training(self) -> str:
+        """Format return and success of the last training episodes, with exploration noise."""
         values = f"return {mean(row['train/return'] for row in self._recent):.1f}"
         name = "train/success_end"
         if any(name in row for row in self._recent):  # a row without it failed
             values += f", success {mean(row.get(name, 0.0) for row in self._recent):.0%}"
         count = len(self._recent)
         about = f"the last {count} episodes, with noise" if count > 1 else "one episode, with noise"
-        if not updates:
+        if not self._updates:
             about += f"; learning begins at step {self._learning_starts:,}"
         return f"{values} ({about})"
 
     def _compared(self) -> str:
-        """The returns to compare with; why the agent's may be below all of them."""
+        """Format the returns to compare with, and why the agent may be below all of them."""
         names = ", ".join(f"{name} {value:.1f}" for name, value in self._scale.items())
         return f"{names}{self._excuse()}"
 
     def _excuse(self) -> str:
-        """Why the newest return may be below all that it is compared with; empty if it is not."""
+        """Explain why the newest return may be below all references; empty if it is not."""
         newest = self._returns[-1] if self._returns else self._training_return
         if newest is None or not self._scale or newest >= min(self._scale.values()):
             return ""
         return f"; at first an agent is often below {min(self._scale, key=self._scale.__getitem__)}"
 
     def _sparkline(self) -> str:
-        """The returns of all evaluations, from the lowest to the highest that is shown."""
+        """Draw the returns of all evaluations on a scale from the lowest to the highest value."""
         known = [*self._returns, *self._scale.values()]
         low, high = min(known), max(known)
         encoding = (self.console.encoding or "").lower()
@@ -237,7 +240,7 @@ def sparkline(values: Sequence[float], low: float, high: float, levels: str = SP
 
 
 def _earlier_returns(run: Run) -> list[float]:
-    """The mean returns of a resumed run's evaluations so far; empty for a new one."""
+    """Return the mean returns of a resumed run's evaluations so far."""
     try:
         with (run.path / METRICS_FILE).open(newline="", encoding="utf-8") as file:
             return [
@@ -248,13 +251,13 @@ def _earlier_returns(run: Run) -> list[float]:
 
 
 def _clock(seconds: float) -> str:
-    """Seconds as minutes:seconds or hours:minutes:seconds."""
+    """Format seconds as minutes:seconds or hours:minutes:seconds."""
     text = str(timedelta(seconds=round(seconds)))
     return text.removeprefix("0:")
 
 
 def describe(evaluation: Evaluation) -> str:
-    """An evaluation in one line, with its intervals."""
+    """Describe an evaluation in one line, with its intervals."""
     returns, end = evaluation.returns, evaluation.success_end
     line = f"return {returns.mean:.1f} [{returns.low:.1f}, {returns.high:.1f}]"
     if end is not None and evaluation.success_any and evaluation.success_share:

@@ -1,4 +1,4 @@
-"""What a run is made of: environments, agent, and where it stands."""
+"""What a run needs before its first step: environments, agent, timing of this machine."""
 
 from __future__ import annotations
 
@@ -32,22 +32,23 @@ from merl.training.loop import Progress, Randomness
 from merl.training.timing import measure, use_threads
 
 
-class Parts:
-    """Environments, agent, and where the run stands.
+class Setup:
+    """Environments, agent, progress and random streams of a run.
 
     Attributes:
         config: with `device`, `threads`, the agent's `precision` and `torch_compile` decided.
         left_open: names of the fields that this machine has decided.
-        timing: what this machine needs for a step and an update.
-        env: to act in.
-        eval_env: to be evaluated in; None where there are no evaluations (`eval.every` is 0).
-        home: the working folder at the start, which a relative run folder lies in.
-        films: whether that can be filmed.
-        space: what the agent consumes.
-        action_space: what it does.
+        timing: time of a step and of an update on this machine.
+        env: the environment for training.
+        eval_env: the environment for evaluation; None without evaluations (`eval.every` is 0).
+        home: the working folder at the start, which contains a relative run folder.
+        records_video: whether `eval_env` renders images.
+        space: the observation space, with the keys that the agent uses.
+        action_space: the action space.
+        device: where the networks live.
         agent: the learner.
-        progress: where the run stands.
-        randomness: its random streams.
+        progress: counts of steps, updates and episodes.
+        randomness: the random streams of the run.
     """
 
     def __init__(
@@ -58,10 +59,10 @@ class Parts:
         home: Path,
     ) -> None:
         self.env, self.eval_env, self.home = env, eval_env, home
-        self.films = eval_env is not None and eval_env.render_mode == "rgb_array"
+        self.records_video = eval_env is not None and eval_env.render_mode == "rgb_array"
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
-        bounded(config.agent, config.replay.discount)  # what is wrong is refused before timing
+        bounded(config.agent, config.replay.discount)  # rejects bad values before timing
         check_memory(config, self.space, self.action_space)
         keep_freed_memory()
         # Without evaluations there are no videos whose frames could be timed.
@@ -91,16 +92,16 @@ class Parts:
 
     @classmethod
     @contextmanager
-    def prepare(cls, config: TrainConfig, *, new: bool) -> Iterator[Parts]:
-        """Build all that a run needs; what cannot work is refused here, and nothing is written.
+    def prepare(cls, config: TrainConfig, *, new: bool) -> Iterator[Setup]:
+        """Build what a run needs. Reject here what cannot work; write nothing.
 
         Args:
             config: of the run.
-            new: the run begins, so its folder must not exist and its replay must fit; the module of
-                a user's environment is looked for in the working folder.
+            new: a new run: its folder must not exist and its replay must fit; the module of a
+                user's environment may lie in the working folder.
 
         Raises:
-            MerlError: a device, renderer, sense, folder or size that is not to be had.
+            MerlError: a device, renderer, observation, folder or size is not available.
         """
         choose_device(config.device)
         processors = os.cpu_count() or 1
@@ -160,10 +161,10 @@ def bounded(agent: AgentConfig, discount: float) -> AgentConfig:
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of that name; "auto" is CUDA where it is there.
+    """Return the device of that name; "auto" is CUDA if available.
 
     Raises:
-        MerlError: CUDA is asked for and not there.
+        MerlError: CUDA is requested and not available.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -175,18 +176,19 @@ def choose_device(name: str) -> torch.device:
 
 
 def device_name(name: str) -> Literal["cpu", "cuda"]:
-    """The name of the device that `choose_device` chooses."""
+    """Return the name of the device that `choose_device` chooses."""
     return "cuda" if choose_device(name).type == "cuda" else "cpu"
 
 
 def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.Box) -> None:
-    """Refuse networks or batches that this process could never hold.
+    """Reject networks or batches that cannot fit into the memory of this process.
 
-    Counted are the weights with gradient, moments and average, and the batch's inputs with what one
-    layer makes of them: less than what an update takes, so that nothing is refused that would fit.
+    The estimate counts the weights with gradient, Adam's moments and average, and the batch's
+    inputs with the output of one layer. It is below what an update takes, so that nothing that fits
+    is rejected.
 
     Raises:
-        MerlError: naming what is too large.
+        MerlError: names what is too large.
     """
     with torch.device("meta"):
         networks = make_networks(

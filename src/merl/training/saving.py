@@ -1,0 +1,145 @@
+"""Write the checkpoints of a run, and restore it from one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+from merl.acting.environments import Environments, WorkerDied
+from merl.core import EnvironmentsLost
+from merl.core.guards import LossGuard
+from merl.replay import ReplayBuffer
+from merl.runs import checkpoint
+from merl.runs.checkpoint import Checkpoint
+from merl.runs.plain import to_plain
+from merl.runs.run import Run
+from merl.training.callbacks import Callback
+from merl.training.evaluator import Evaluations
+from merl.training.loop import Progress
+from merl.training.meters import Clock, Interval
+from merl.training.setup import Setup
+
+
+class Saver:
+    """Writes checkpoints that a run resumes from exactly.
+
+    Args:
+        setup: agent, progress and random streams.
+        run: the run's folder.
+        replay: saved beside the checkpoints.
+        environments: their random states are saved.
+        evaluations: the last one gives a checkpoint its score.
+        clock: time of the run so far.
+        guard: rejects weights and losses that are not finite.
+        callbacks: notified of checkpoints and warnings.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        run: Run,
+        replay: ReplayBuffer,
+        environments: Environments,
+        evaluations: Evaluations,
+        clock: Clock,
+        guard: LossGuard,
+        callbacks: Callback,
+    ) -> None:
+        self._setup, self._run, self._replay = setup, run, replay
+        self._environments, self._evaluations = environments, evaluations
+        self._clock, self._guard, self._callbacks = clock, guard, callbacks
+        self._saved: dict[str, Any] | None = None  # the progress at the last save
+        self._states: Sequence[Mapping[str, Any] | None] = [None] * environments.count
+        self.interval = Interval(setup.config.save_every)
+
+    def save(self, *, within_episode: bool = False) -> bool:
+        """Write a checkpoint, unless the last one is of the present state.
+
+        If it cannot be written, warn and continue.
+
+        Args:
+            within_episode: an episode that takes long is still in progress.
+
+        Returns:
+            Whether a checkpoint of the present state is on the disk.
+
+        Raises:
+            MerlError: the run's folder is gone, or a weight or loss is not finite.
+        """
+        self._guard.check()
+        self._run.check_there()
+        setup, progress = self._setup, self._setup.progress
+        if self._saved == dataclasses.asdict(progress):
+            return True
+        last = self._evaluations.last
+        fresh = last is not None and progress.evaluated == progress.step
+        state = {
+            "progress": dataclasses.asdict(progress),
+            "randomness": setup.randomness.state_dict(),
+            "replay": self._replay.state_dict(),
+            "environment": self._environment_states(),
+            "seconds": self._clock.seconds(),
+            "cpu_seconds": self._clock.cpu_seconds(),
+            "env": to_plain(setup.config.env),
+        }
+        try:
+            self._replay.flush()
+            checkpoint.save(
+                self._run.checkpoints,
+                progress.step,
+                setup.agent,
+                state,
+                score=last.returns.mean if fresh and last else None,
+                keep=setup.config.keep,
+            )
+        except OSError as error:
+            self._run.check_there()
+            reason = error.strerror or error
+            self._callbacks.on_warning(
+                f"the checkpoint at step {progress.step} was not written: {reason}"
+            )
+            return False
+        finally:
+            self.interval.saved(within_episode)
+        self._saved = dataclasses.asdict(progress)
+        self._replay.settle()
+        self._callbacks.on_checkpoint(progress.step)
+        return True
+
+    def restore(self, start: Checkpoint) -> None:
+        """Restore agent, progress, replay, random streams and environments from a checkpoint.
+
+        Raises:
+            MerlError: the checkpoint cannot be used.
+            EnvironmentsLost: an environment's process died.
+        """
+        setup, state = self._setup, start.state()
+        checkpoint.load_agent(setup.agent, start)
+        try:
+            with checkpoint.readable(start):
+                counts = state["progress"]
+                if not all(isinstance(count, int) and count >= 0 for count in counts.values()):
+                    raise TypeError(f"progress is {counts}")
+                setup.progress = Progress(**counts)
+                setup.randomness.load_state_dict(state["randomness"])
+                self._replay.load_state_dict(state["replay"])
+                states = state["environment"]
+                self._states = states if isinstance(states, list) else [states]
+                self._environments.restore(self._states)
+                self._clock.restore(float(state["seconds"]), float(state["cpu_seconds"]))
+        except WorkerDied as died:
+            raise EnvironmentsLost(
+                f"an environment's process {died} right after its start: see what it said above"
+            ) from None
+
+    def resumes_exactly(self) -> bool:
+        """Return whether the environments' random generators are part of the checkpoint."""
+        return all(state and "bit_generator" in state for state in self._environment_states())
+
+    def _environment_states(self) -> Sequence[Mapping[str, Any] | None]:
+        """Return the states of the environments; after a worker died, the last known states."""
+        with suppress(WorkerDied):
+            self._states = self._environments.states()
+        return self._states

@@ -28,30 +28,30 @@ SHORT = (
     "--num-envs 1 --synchronous --threads 1 --agent.precision fp32 --agent.torch-compile no "
     "--eval.every 1000 --eval.episodes 1 --eval.video none"
 )
-"""12 updates, after the end of the first episode."""
+"""Flags for 12 updates, after the end of the first episode."""
 
 
 def main() -> int:
-    """Compare, and return the exit code."""
+    """Compare the weights; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("before", help="a commit")
     parser.add_argument("after", nargs="?", help="a commit (default: the working tree)")
     parser.add_argument("--task", default="lift_box")
     parser.add_argument("--presets", nargs="+", default=PRESETS, choices=PRESETS)
     parser.add_argument("--agents", nargs="+", default=AGENTS, choices=AGENTS)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     differing = 0
     with tempfile.TemporaryDirectory() as folder:
         trees = [
             tree(commit, Path(folder) / name)
-            for name, commit in vars(asked).items()
+            for name, commit in vars(options).items()
             if name in ("before", "after")
         ]
-        for preset, agent in product(asked.presets, asked.agents):
+        for preset, agent in product(options.presets, options.agents):
             name = f"{preset}-{agent}"
             runs = [Path(folder) / f"{side}-{name}" for side in ("before", "after")]
             for source, run in zip(trees, runs, strict=True):
-                train(source, [asked.task, "--preset", preset, "--agent", agent], run)
+                train(source, [options.task, "--preset", preset, "--agent", agent], run)
             found = differences(*runs)
             differing += bool(found)
             print(f"{name:16} {'the same' if not found else f'DIFFERS in {found}'}", flush=True)
@@ -59,7 +59,7 @@ def main() -> int:
 
 
 def tree(commit: str | None, folder: Path) -> Path:
-    """Return the repository at a commit, extracted into a folder; without a commit, as it is."""
+    """Return the repository at a commit, extracted into a folder; None: the working tree."""
     if commit is None:
         return ROOT
     folder.mkdir()
@@ -69,7 +69,7 @@ def tree(commit: str | None, folder: Path) -> Path:
 
 
 def train(source: Path, arguments: list[str], run: Path) -> None:
-    """Train with the code of that tree."""
+    """Train with the code of the tree `source`; write the run to the folder `run`."""
     command = [sys.executable, "-m", "merl.cli", "train", *arguments, *SHORT.split()]
     env = os.environ | {"PYTHONPATH": str(source / "src"), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
@@ -80,7 +80,7 @@ def train(source: Path, arguments: list[str], run: Path) -> None:
 
 
 def differences(before: Path, after: Path) -> list[str]:
-    """Return the names of the tensors that are not equal, of the last checkpoint of each run."""
+    """Return the names of the tensors that differ between the last checkpoints of two runs."""
     one, two = (
         load_file(max(run.glob("checkpoints/*")) / "weights.safetensors") for run in (before, after)
     )

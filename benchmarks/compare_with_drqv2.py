@@ -1,11 +1,11 @@
-"""Our update of DrQ-v2 beside its authors', of which PATH is a clone (facebookresearch/drqv2).
+"""Compare merl's update of DrQ-v2 with its authors'; PATH is a clone of facebookresearch/drqv2.
 
-    python benchmarks/compare_with_drqv2.py PATH              # what is computed
-    python benchmarks/compare_with_drqv2.py PATH --repeats 9  # how long it takes
+    python benchmarks/compare_with_drqv2.py PATH              # compare losses and weights
+    python benchmarks/compare_with_drqv2.py PATH --repeats 9  # compare the speed
 
-Both begin with the same weights and are given the same batches, crops and noise, in float64; then
-losses and weights are compared. Timed is the full size in single precision, in turns with what
-`merl bench update` holds to be a plain DrQ-v2.
+For losses and weights, both updates start with the same weights and get the same batches, crops and
+noise, in float64. For the speed, the authors' update in full size and single precision takes turns
+with the plain DrQ-v2 of `merl bench update`.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
 from merl.bench.update import ACTIONS, as_sample, noise_batch, reference_of
 from merl.core import Batch
 
-DECISION = 200_000  # of the 500,000 over which the noise falls
+ACTION = 200_000  # index of an action; the noise falls over 500,000 actions
 CONFIG = replace(DrQV2Config(), hidden_dim=64, precision="fp32", noise_steps=1_000_000)
-CASE = Case("drqv2", CONFIG, {"image": (84, 84, 3)}, {}, batch=6, step=2 * DECISION)
-SIDE, CHANNELS = 35, 32  # of the encoder's last feature map
+CASE = Case("drqv2", CONFIG, {"image": (84, 84, 3)}, {}, batch=6, step=2 * ACTION)
+SIDE, CHANNELS = 35, 32  # size of the encoder's last feature map
 
 
 def main(path: tyro.conf.Positional[Path], repeats: int = 0) -> None:
-    """Compare four updates; or, with repeats, time them."""
+    """Compare four updates; with `repeats`, compare the speed instead."""
     if repeats:
         time(path, repeats)
     else:
@@ -48,12 +48,12 @@ def main(path: tyro.conf.Positional[Path], repeats: int = 0) -> None:
 
 
 def time(path: Path, repeats: int) -> None:
-    """An update of theirs in turns with the reference's."""
-    theirs, _ = made_by_its_authors(path, hidden_dim=1024, actions=ACTIONS)
+    """Time the authors' update in turns with the reference's; print the speeds."""
+    theirs, _ = authors_agent(path, hidden_dim=1024, actions=ACTIONS)
     sample, plain = as_sample(noise_batch(256), vector=False), reference_of("drqv2")
     given = (sample.image, sample.action, sample.reward, sample.discount, sample.next_image)
     sides: dict[str, Work] = {
-        "its authors'": lambda: theirs.update(iter([given]), DECISION),
+        "its authors'": lambda: theirs.update(iter([given]), ACTION),
         "the reference": lambda: plain.update(sample),
     }
     turns = take_turns(sides, repeats, others=sides)
@@ -64,8 +64,8 @@ def time(path: Path, repeats: int) -> None:
 
 
 def compare(path: Path) -> None:
-    """Four updates of either."""
-    theirs, utils = made_by_its_authors(path, CONFIG.hidden_dim, actions=6)
+    """Make four updates with both agents; print losses and the distance of the weights."""
+    theirs, utils = authors_agent(path, CONFIG.hidden_dim, actions=6)
     for part in (theirs.encoder, theirs.actor, theirs.critic, theirs.critic_target):
         part.double()
     ours = double(CASE.agent())
@@ -76,19 +76,19 @@ def compare(path: Path) -> None:
     for update in range(4):
         batch, chance = CASE.batch_of(update, torch.float64), CASE.chance_of(update)
         found = ours.learn(batch, draws_of(chance, CONFIG, torch.float64, CASE.step))
-        told = updated(theirs, utils, batch, chance)
+        losses = authors_update(theirs, utils, batch, chance)
         for name in ("critic_loss", "actor_loss"):
-            print(f"update {update + 1}, {name}: {float(found[name]):.9f} and {told[name]:.9f}")
+            print(f"update {update + 1}, {name}: {float(found[name]):.9f} and {losses[name]:.9f}")
     worst: dict[str, float] = {}
     for part, mine, other in weights(ours, theirs):
         apart = error(theirs_from(mine).detach(), other.detach())
         worst[part] = max(worst.get(part, 0.0), apart)
     for part, apart in worst.items():
-        print(f"weights of {part}: apart by {apart:.1e} of their norm")
+        print(f"weights of {part}: relative distance {apart:.1e}")
 
 
-def updated(theirs: Any, utils: Any, batch: Batch, chance: Chance) -> dict[str, float]:
-    """Their update of this batch with this chance, which they would draw themselves."""
+def authors_update(theirs: Any, utils: Any, batch: Batch, chance: Chance) -> dict[str, float]:
+    """Make the authors' update with the given random numbers; return the losses."""
     crops = map(crop, (chance.shift["image"], chance.shift_next["image"]))
     noises = iter((chance.noise_next, chance.noise))
     given = (
@@ -108,14 +108,12 @@ def updated(theirs: Any, utils: Any, batch: Batch, chance: Chance) -> dict[str, 
         mock.patch.object(utils, "_standard_normal", normal),
         mock.patch.object(Tensor, "float", Tensor.double),
     ):
-        told: dict[str, float] = theirs.update(iter([given]), DECISION)
-    return told
+        losses: dict[str, float] = theirs.update(iter([given]), ACTION)
+    return losses
 
 
-def made_by_its_authors(
-    folder: Path, hidden_dim: int, actions: int
-) -> tuple[Any, types.ModuleType]:
-    """Their agent and their utilities; of Hydra, which they import, nothing is needed here."""
+def authors_agent(folder: Path, hidden_dim: int, actions: int) -> tuple[Any, types.ModuleType]:
+    """Return the authors' agent and utilities; Hydra, which they import, becomes empty modules."""
     for name in ("hydra", "omegaconf"):
         sys.modules[name] = types.ModuleType(name)
     sys.modules["omegaconf"].OmegaConf = None  # type: ignore[attr-defined]
@@ -139,7 +137,7 @@ def made_by_its_authors(
 
 
 def weights(ours: DDPG, theirs: Any) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """Every weight of either side, and what it belongs to."""
+    """Yield (part, merl's weight, the authors' weight) for every weight."""
     networks, average = ours.networks, ours.critic_target
     pairs: dict[str, tuple[Any, Any]] = {
         "the encoder": (networks.encoders, theirs.encoder),
@@ -158,19 +156,19 @@ def weights(ours: DDPG, theirs: Any) -> Iterator[tuple[str, Tensor, Tensor]]:
 
 
 def theirs_from(weight: Tensor) -> Tensor:
-    """In their order: a trunk reads channels, rows, columns; ours rows, columns, channels."""
+    """Convert a weight to the authors' order: channels, rows, columns for a trunk's inputs."""
     if weight.shape[-1] != SIDE * SIDE * CHANNELS:
         return weight
     return weight.reshape(-1, SIDE, SIDE, CHANNELS).permute(0, 3, 1, 2).flatten(1)
 
 
 def frames(stack: Tensor) -> Tensor:
-    """(B, K, H, W, C) to their (B, K C, H, W)."""
+    """Convert a stack (B, K, H, W, C) to the authors' form (B, K C, H, W)."""
     return stack.permute(0, 1, 4, 2, 3).flatten(1, 2)
 
 
 def crop(shift: Tensor) -> Tensor:
-    """A crop's row and column as their column and row, (B, 1, 1, 2)."""
+    """Convert a crop's (row, column) to the authors' (column, row), (B, 1, 1, 2)."""
     return shift.flip(-1)[:, None, None].double()
 
 

@@ -1,4 +1,7 @@
-"""Draw the figures of README and docs from results/: python benchmarks/make_figures.py."""
+"""Draw the figures of README and docs from results/.
+
+python benchmarks/make_figures.py
+"""
 
 import csv
 import json
@@ -16,25 +19,25 @@ ROOT = Path(__file__).resolve().parent.parent
 DATA, IMAGES = ROOT / "results", ROOT / "docs/images"
 AGENTS = DATA / "agents"
 MOST = {"state": 100_000, "laptop": 100_000}
-"""Steps that the agents are compared over."""
-SENSES = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", "proprio")}
+"""Steps up to which the agents are compared, by preset."""
+COMPARED = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", "proprio")}
 
 
 def main() -> None:
-    """Draw every picture that is made of numbers."""
+    """Draw all figures; print the table of the evaluations."""
     laptop()
     agents()
     small_tasks()
     for file in sorted(AGENTS.glob("*-evaluation.json")):
-        print(evaluated(file))
+        print(table_row(file))
 
 
-def evaluated(file: Path) -> str:
-    """A row of a table: what an evaluation came to, with its 95 % intervals."""
-    told = json.loads(file.read_text())
-    episodes = told["episodes"]
+def table_row(file: Path) -> str:
+    """Return the results of an evaluation, with 95 % intervals, as a row of a Markdown table."""
+    evaluation = json.loads(file.read_text())
+    episodes = evaluation["episodes"]
     mean, low, high = bootstrap_interval([episode["return"] for episode in episodes])
-    cells = [file.name.removesuffix("-evaluation.json"), f"{told['step']:,}"]
+    cells = [file.name.removesuffix("-evaluation.json"), f"{evaluation['step']:,}"]
     cells.append(f"{mean:.1f} [{low:.1f}, {high:.1f}]")
     for name in ("success_end", "success_any"):
         count = int(sum(episode[name] for episode in episodes))
@@ -44,7 +47,7 @@ def evaluated(file: Path) -> str:
 
 
 def laptop() -> None:
-    """Preset laptop by the clock."""
+    """Draw preset laptop over wall-clock time."""
     lines = {row.name: row.returns.mean for row in references("reach_duplo")}
     lines.pop("no motion")
     learning_curves(
@@ -57,10 +60,10 @@ def laptop() -> None:
 
 
 def agents() -> None:
-    """The agents beside each other on `reach_duplo`, by what they sense."""
+    """Draw the agents on `reach_duplo`, one figure per preset."""
     task = "reach_duplo"
     known = {row.name: row.returns.mean for row in references(task)}
-    for preset, names in SENSES.items():
+    for preset, names in COMPARED.items():
         runs = {f"{name}, matched": seeds(task, name, preset) for name in names}
         learning_curves(
             runs,
@@ -71,7 +74,7 @@ def agents() -> None:
 
 
 def seeds(task: str, agent: str, preset: str) -> list[Curve]:
-    """The evaluations of an agent's runs, as far as those of the others go (`MOST`)."""
+    """Return the evaluations of an agent's runs, up to the step in `MOST`."""
     files = sorted(AGENTS.glob(f"{task}-{agent}-{preset}-matched-s*.csv"))
     if (agent, preset) == ("merl", "laptop"):
         files = sorted(DATA.glob("laptop-seed?.csv"))  # these runs are merl's on reach_duplo
@@ -80,7 +83,7 @@ def seeds(task: str, agent: str, preset: str) -> list[Curve]:
 
 
 def small_tasks() -> None:
-    """The dot that only camera and joints together can steer to its mark."""
+    """Draw the task in which only camera and joints together can steer the dot to its mark."""
     with (DATA / "small_tasks.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["task"] == SPLIT]
     runs = {

@@ -1,6 +1,7 @@
-"""Draw the tasks as both renderers see them (needs OpenGL).
+"""Draw the tasks with both renderers (needs OpenGL).
 
-Writes docs/images/tasks.png: the same state by `gl` and `raster`, and how much they differ.
+Writes docs/images/tasks.png: the same state by `gl` and by `raster`, and the difference of the
+images.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ SEED, SIZE = 3, 240
 RENDERERS: tuple[RendererName, ...] = ("gl", "raster")
 
 
-def picture(task: str, renderer: RendererName, occluded: bool, size: int) -> NDArray[np.uint8]:
-    """The first picture of an episode."""
+def first_image(task: str, renderer: RendererName, occluded: bool, size: int) -> NDArray[np.uint8]:
+    """Return the first image of an episode."""
     env = make_env(
         task, renderer=renderer, occluded=occluded, image_size=size, observations=("image",)
     )
@@ -33,13 +34,13 @@ def picture(task: str, renderer: RendererName, occluded: bool, size: int) -> NDA
 
 
 def main() -> None:
-    """Draw a row for each task and each occluded form."""
+    """Draw one row for each task and each occluded form; print the mean differences (of 255)."""
     rows = [(task, False) for task in TASKS] + [(task, True) for task in BOX_TASKS]
     figure = Figure(figsize=(3.0 * 3, 3.0 * len(rows)), dpi=80, layout="constrained")
     for (task, occluded), panels in zip(rows, figure.subplots(len(rows), 3), strict=True):
-        gl, raster = (picture(task, name, occluded, SIZE) for name in RENDERERS)
+        gl, raster = (first_image(task, name, occluded, SIZE) for name in RENDERERS)
         difference = np.abs(gl.astype(int) - raster)
-        small = [picture(task, name, occluded, 84).astype(int) for name in RENDERERS]
+        small = [first_image(task, name, occluded, 84).astype(int) for name in RENDERERS]
         mean = np.abs(small[0] - small[1]).mean()
         name = task + " --occluded" * occluded
         for axes, image, title in zip(

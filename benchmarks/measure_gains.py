@@ -1,8 +1,10 @@
-"""What each thing that makes an update fast gains: python benchmarks/measure_gains.py.
+"""Measure the gain of each optimisation of an update on the CPU.
 
-The update of `merl bench update` (six layers, 84x84, batch 256), as it is and with one thing taken
-back at a time, in turns. One thread and processor time, for what else the machine does is not to
-count; medians.
+    python benchmarks/measure_gains.py
+
+Times the update of `merl bench update` (six layers, 84x84, batch 256), as it is and without one
+optimisation at a time, in turns, on one thread. The times are processor time, which excludes other
+load on the machine; the results are medians.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ Change = Callable[[DDPG], AbstractContextManager[Any]]
 
 
 def main(precision: Literal["bf16", "fp32"] = "bf16", repeats: int = 5) -> None:
-    """Take each thing back, and print what an update then takes."""
+    """Switch off each optimisation, and print the time of an update without it."""
     torch.set_num_threads(1)
     print(circumstances())
     batch = noise_batch(256)
@@ -65,7 +67,7 @@ def main(precision: Literal["bf16", "fp32"] = "bf16", repeats: int = 5) -> None:
 
 @contextmanager
 def given_back() -> Iterator[None]:
-    """As glibc does by itself."""
+    """Return freed memory to the system, as glibc does by default."""
     keep_freed_memory(False)
     try:
         yield
@@ -75,7 +77,7 @@ def given_back() -> Iterator[None]:
 
 @contextmanager
 def channels_first(agent: DDPG) -> Iterator[None]:
-    """Weights and pictures in torch's own order."""
+    """Keep weights and images in torch's default memory order."""
     agent.networks.encoders.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     as_input = augmentation.to_input
 
@@ -87,7 +89,7 @@ def channels_first(agent: DDPG) -> Iterator[None]:
 
 
 def scale_pixels(encoder: encoders.ConvEncoder, stacks: Tensor) -> Tensor:
-    """X / 255 - 0.5 in fp32, and through the layers as they are."""
+    """Encode images with their pixels scaled (x / 255 - 0.5) in fp32 before the first layer."""
     whole = augmentation.to_input(stacks, torch.float32)
     scaled = whole.add_(128).mul_(1 / 255).sub_(0.5)
     maps: Tensor = encoder.convolutions(scaled)
@@ -96,7 +98,7 @@ def scale_pixels(encoder: encoders.ConvEncoder, stacks: Tensor) -> Tensor:
 
 @contextmanager
 def gradients_of_all() -> Iterator[None]:
-    """Also the critic's, of the actor's loss."""
+    """Compute the gradients of the actor's loss for the critic's weights too."""
     with (
         patch.object(ddpg, "step_optimizer", step_all),
         patch.object(ddpg, "frozen", lambda _: nullcontext()),
@@ -105,7 +107,7 @@ def gradients_of_all() -> Iterator[None]:
 
 
 def step_all(optimizer: torch.optim.Optimizer, loss: Tensor, _: Any) -> None:
-    """The usual three lines, which also give the critic gradients of the actor's loss."""
+    """Make an optimizer step with gradients for all weights, the critic's included."""
     optimizer.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
     optimizer.step()
@@ -113,7 +115,7 @@ def step_all(optimizer: torch.optim.Optimizer, loss: Tensor, _: Any) -> None:
 
 @contextmanager
 def weight_by_weight(agent: DDPG) -> Iterator[None]:
-    """Adam as torch.optim takes it by default on a CPU."""
+    """Use Adam in torch's default form on a CPU: not fused."""
     groups = [g for o in (agent.critic_optimizer, agent.actor_optimizer) for g in o.param_groups]
     for group in groups:
         group["fused"] = None

@@ -1,13 +1,16 @@
-"""All that is to be measured on a GPU, in one go: python benchmarks/measure_gpu.py --out FOLDER.
+"""Measure the speed of merl on a GPU.
 
-Six parts, each written as soon as it is done; one that fails is told and does not stop the others:
+    python benchmarks/measure_gpu.py --out FOLDER
 
-agrees    that a recorded update is the update that is launched operation by operation, but for the
-          order in which a card adds; and that none of a hundred more waits for the card
-launches  of how many operations an update consists: what it costs without a CUDA graph, and much of
-          it with one; the same on a CPU
-gains     the whole update, drawn on the card, as it is and with one thing changed at a time
-profile   which kernels an update consists of, and how long each takes
+Six parts. Each result is written at once; if a part fails, its error is printed and the others run:
+
+agrees    checks that a recorded update equals the update that is launched operation by operation,
+          except for the GPU's order of additions, and that none of 100 more updates waits for the
+          GPU
+launches  counts the operations of an update, which determine its time without a CUDA graph, and
+          much of it with one; the count is the same on a CPU
+gains     times the whole update, sampled on the GPU, as it is and with one change at a time
+profile   lists the kernels of an update and their times
 update    merl bench update
 train     merl bench train: the whole loop, with one environment and with several
 """
@@ -46,7 +49,7 @@ from merl.training.updating import Recorded, UpdateOnDevice
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """Of an update: as it is, or otherwise in one way."""
+    """A form of the update: as it is by default, or with a change."""
 
     precision: Literal["bf16", "fp32"] = "bf16"
     compiled: bool = False
@@ -69,15 +72,15 @@ def main(
     updates: int = 100,
     repeats: int = 7,
 ) -> None:
-    """Measure.
+    """Measure all parts.
 
     Args:
-        out: the folder for what was found.
-        parts: which.
-        agent: whose update, in agrees, launches, gains and profile.
-        batch_size: B, in all but train.
-        updates: of a turn, in gains.
-        repeats: turns of each side.
+        out: the folder for the results.
+        parts: the parts to measure.
+        agent: the agent in agrees, launches, gains and profile.
+        batch_size: B, in all parts except train.
+        updates: updates in a turn, in gains.
+        repeats: turns of each variant.
     """
     out.mkdir(parents=True, exist_ok=True)
     console = Console(markup=False)
@@ -102,23 +105,23 @@ def main(
 
 
 def shown(bench: Any, **asked: Any) -> Any:
-    """What a bench found; printed, too."""
+    """Run a bench; print its table and return its result."""
     result = bench.run(**asked)
     Console(markup=False).print(bench.table(result))
     return result
 
 
 def loop(repeats: int) -> Any:
-    """The whole loop; with preset laptop where OpenGL is missing."""
+    """Time the whole loop; with preset laptop if OpenGL is missing."""
     try:
         return shown(train, repeats=repeats)
     except MerlError as error:
-        print(f"{error}: with preset laptop", file=sys.stderr)
+        print(f"{error}; now with preset laptop", file=sys.stderr)
         return shown(train, repeats=repeats, preset="laptop")
 
 
 def agrees(agent: str, batch_size: int) -> dict[str, float]:
-    """How far weights are apart after the same updates, recorded and not: of each tensor's norm."""
+    """Return the largest relative distance of a weight after the same updates, recorded or not."""
     found = {}
     for form in (Form(precision="fp32"), Form(), Form(compiled=True)):
         recorded, learner = work_of(agent, batch_size, form)
@@ -138,7 +141,7 @@ def agrees(agent: str, batch_size: int) -> dict[str, float]:
             if torch.cuda.is_available():
                 torch.cuda.set_sync_debug_mode("default")
         name = f"{form.precision}{', compiled' if form.compiled else ''}"
-        print(f"{name}: recorded and launched weights are {apart:.2g} apart; nothing waits")
+        print(f"{name}: weights differ by {apart:.2g} of their norm; no update waits for the GPU")
         found[name] = apart
     return found
 
@@ -160,7 +163,7 @@ class Launches(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 def launches(agent: str) -> dict[str, int]:
-    """Of an update in bf16 with the twin critics one by one, and at once."""
+    """Count the operations of an update in bf16, with the twin critics one by one and at once."""
     batch, counts = update.noise_batch(8), {}
     for name, at_once in (("one by one", False), ("at once", True)):
         learner = update.learner_of(agent, "bf16", torch.device("cpu"))
@@ -174,7 +177,7 @@ def launches(agent: str) -> dict[str, int]:
 
 
 def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, Any]:
-    """Updates per second of every form, in turns."""
+    """Time all forms in turns; return their updates per second."""
     forms = {
         "as it is": Form(),
         "without a CUDA graph": Form(graph=False),
@@ -193,7 +196,7 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
             works[name] = work_of(agent, batch_size, form)
             print(f"{name}: ready in {time.perf_counter() - begun:.1f} s", file=sys.stderr)
         except Exception as error:
-            print(f"{name}: left out, {type(error).__name__}: {error}", file=sys.stderr)
+            print(f"{name}: skipped, {type(error).__name__}: {error}", file=sys.stderr)
     rates: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeats):
         for name, (work, learner) in works.items():
@@ -207,7 +210,7 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
 
 
 def work_of(agent: str, batch_size: int, form: Form) -> tuple[UpdateOnDevice, DDPG]:
-    """An update in that form, recorded and ready, and who learns by it."""
+    """Return an update in the given form, recorded, and the agent that learns by it."""
     device = choose_device("auto")
     learner = update.learner_of(agent, form.precision, device, compiled=form.compiled)
     replay = OnDevice([update.noise_replay()], device)
@@ -222,7 +225,7 @@ def work_of(agent: str, batch_size: int, form: Form) -> tuple[UpdateOnDevice, DD
 
 
 def profiles(agent: str, batch_size: int) -> dict[str, Any]:
-    """What an update consists of, and compiled on a GPU."""
+    """Profile an update; on a GPU also the compiled one."""
     found = {"not compiled": kernels(agent, batch_size, compiled=False)}
     if torch.cuda.is_available():
         found["compiled"] = kernels(agent, batch_size, compiled=True)
@@ -230,9 +233,9 @@ def profiles(agent: str, batch_size: int) -> dict[str, Any]:
 
 
 def kernels(agent: str, batch_size: int, *, compiled: bool, updates: int = 20) -> dict[str, Any]:
-    """What it consists of, longest first; on a GPU kernels, else operations."""
+    """Profile an update: its kernels (on a CPU its operations), the longest first."""
     on_gpu = torch.cuda.is_available()
-    # Times inside a graph are not to be trusted everywhere: its kernels, launched one by one.
+    # Times of kernels inside a graph are not always reliable: launch them one by one.
     work, _ = work_of(agent, batch_size, Form(graph=False, compiled=compiled))
     kind = ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU
     with profile(activities=[kind]) as profiled:
@@ -240,7 +243,7 @@ def kernels(agent: str, batch_size: int, *, compiled: bool, updates: int = 20) -
     rows = []
     for event in profiled.key_averages():
         if on_gpu and event.device_type != DeviceType.CUDA:
-            continue  # what the host did
+            continue  # the host's time
         own = event.self_device_time_total if on_gpu else event.self_cpu_time_total
         rows.append((own / updates, event.count / updates, event.key))
     rows.sort(reverse=True)
@@ -253,7 +256,7 @@ def kernels(agent: str, batch_size: int, *, compiled: bool, updates: int = 20) -
 
 
 def seconds(work: Callable[[], object], times: int) -> float:
-    """Of doing it so many times, to its end on the card."""
+    """Return the seconds that `times` calls of `work` take, with the GPU's work."""
     wait()
     begun = time.perf_counter()
     for _ in range(times):
@@ -263,7 +266,7 @@ def seconds(work: Callable[[], object], times: int) -> float:
 
 
 def wait() -> None:
-    """For the card."""
+    """Wait until the GPU has done its work."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
 

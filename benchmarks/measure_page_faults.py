@@ -1,7 +1,9 @@
-"""What keeping freed memory saves: python benchmarks/measure_page_faults.py. One thread, bf16.
+"""Measure the time that an update saves by keeping freed memory; one thread, bf16.
 
-An update with glibc's defaults and one with `keep_freed_memory` take turns; processor time, for
-what else the machine does is not to count.
+    python benchmarks/measure_page_faults.py
+
+An update with glibc's defaults and one with `keep_freed_memory` take turns. The times are processor
+time, which excludes other load on the machine.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ ROUNDS, UPDATES = 6, 3
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure the update of two presets and of the reference."""
     torch.set_num_threads(1)
     for preset, task, size in (("laptop", "reach_duplo", 48), ("paper", "move_box", 84)):
         env = make_env(task, renderer="raster", image_size=size)
@@ -49,7 +51,7 @@ def main() -> None:
 
 
 def compare(name: str, update: Work) -> None:
-    """Updates with freed memory given back, and kept."""
+    """Time updates with freed memory given back to the system, and kept; print medians."""
     taken: dict[bool, list[tuple[float, int]]] = {False: [], True: []}
     for _ in range(ROUNDS):
         for keep, results in taken.items():

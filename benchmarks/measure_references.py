@@ -1,9 +1,9 @@
-"""Measure what returns are compared with: random actions, no motion, the expert.
+"""Measure the reference returns: random actions, no motion, the expert.
 
-python benchmarks/measure_references.py [EPISODES [FORM ...]]
+    python benchmarks/measure_references.py [EPISODES [FORM ...]]
 
-Writes src/merl/report/references.json, all of it or the forms that are named ("lift_box occluded").
-No picture is drawn, so the renderer does not matter.
+Writes src/merl/report/references.json: all forms of the tasks, or the named ones ("lift_box
+occluded"). No image is rendered, so the renderer does not matter.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ FORMS: list[tuple[str, dict[str, Any]]] = [
 
 
 def measure(task: str, settings: dict[str, Any], episodes: int) -> list[dict[str, object]]:
-    """The rows of one task in one form."""
+    """Measure one task in one form; return a row for each policy."""
     env = make_env(task, renderer="raster", observations=("proprio",), **settings)
     rng = np.random.default_rng(0)
     expert = ExpertPolicy(env)
@@ -62,7 +62,7 @@ def measure(task: str, settings: dict[str, Any], episodes: int) -> list[dict[str
 
 
 def row(name: str, result: Evaluation) -> dict[str, object]:
-    """One policy's numbers, rounded to what their intervals allow."""
+    """Return one policy's numbers, rounded in proportion to their intervals."""
     assert result.success_end is not None
     return {
         "name": name,

@@ -1,11 +1,11 @@
-"""Measure the renderers: images and steps per second, and how near `raster` is to `gl`.
+"""Measure the renderers: images and steps per second, and the difference of `raster` to `gl`.
 
-python benchmarks/measure_renderers.py [--states 300] [--rounds 7]
+    python benchmarks/measure_renderers.py [--states 300] [--rounds 7]
 
-The speeds take turns within each round; the ratios are taken within a round. `raster` takes one
-thread, `gl` what its OpenGL library takes. Nearness is the mean difference of all pixels (of 255)
-over states that random actions lead to, and the share of pixels that show the same geom as in
-MuJoCo's own segmentation.
+For the speeds, the renderers take turns within each round, and ratios are taken within a round.
+`raster` uses one thread, `gl` as many as its OpenGL library. The difference is the mean over all
+pixels (of 255) in states that random actions reach, and the fraction of pixels that show the same
+geom as MuJoCo's own segmentation.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from merl.tasks.jaco import CAMERA
 
 SIZE = 84
 SIZES = ((84, 1), (84, 2), (48, 1), (48, 2), (32, 1), (32, 2), (24, 1), (24, 3), (480, 1))
-"""Size and samples of the images that are timed."""
+"""(side in pixels, n) of the timed images, which have n x n samples per pixel."""
 
 
 def per_second(call: Callable[[int], object], count: int) -> float:
-    """How often a call is made in a second."""
+    """Return the calls per second; `call` is given the index of the call."""
     start = time.perf_counter()
     for index in range(count):
         call(index)
@@ -38,7 +38,7 @@ def per_second(call: Callable[[int], object], count: int) -> float:
 
 
 def speeds(rounds: int) -> None:
-    """Print images and environment steps per second, with ratios to the same by `gl`."""
+    """Print images and environment steps per second, with ratios to `gl`."""
     actions = np.random.default_rng(0).uniform(-1, 1, (200, 9)).astype(np.float32)
     scene = make_env("reach_duplo", renderer="gl", observations=("proprio",))
     scene.reset(seed=0)
@@ -84,7 +84,7 @@ def _stepping(env: Any, actions: Any) -> Callable[[int], object]:
 
 
 def nearness(states: int) -> None:
-    """Print how near the images are to `gl`'s, for each task."""
+    """Print the difference of the images to those of `gl`, for each task."""
     for task in TASKS:
         env = make_env(task, renderer="gl", observations=("proprio",))
         physics = env.physics
@@ -92,11 +92,11 @@ def nearness(states: int) -> None:
         raster = RasterRenderer(physics, CAMERA.name, SIZE)
         others = {"raster": raster, "2x2": RasterRenderer(physics, CAMERA.name, SIZE, 2)}
         apart: dict[str, list[float]] = {name: [] for name in others}
-        same, draw = [], np.random.default_rng(0)
+        same, rng = [], np.random.default_rng(0)
         for state in range(states):
             if state % 10 == 0:
                 env.reset(seed=state)
-            action = draw.uniform(-1, 1, 9).astype(np.float32)
+            action = rng.uniform(-1, 1, 9).astype(np.float32)
             for _ in range(10):
                 env.step(action)
             drawn = gl.render().astype(int)
@@ -106,8 +106,8 @@ def nearness(states: int) -> None:
             is_geom = labels[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)
             geoms = np.where(is_geom, labels[..., 0], -1)
             same.append(float((raster.render_segmentation() == geoms).mean()))
-        told = ", ".join(f"{name} {np.mean(values):.2f}" for name, values in apart.items())
-        print(f"{task}: mean difference to gl {told}; same geom {np.mean(same):.3%}", flush=True)
+        text = ", ".join(f"{name} {np.mean(values):.2f}" for name, values in apart.items())
+        print(f"{task}: mean difference to gl {text}; same geom {np.mean(same):.3%}", flush=True)
         env.close()
 
 

@@ -1,12 +1,12 @@
-"""The runs behind the curves.
+"""Train the runs of the learning curves.
 
     python benchmarks/measure_runs.py GROUP ... [--seeds 0 1 2] [--jobs 2]
 
-Runs what is missing of the groups named, `--jobs` at a time, each on one thread at the lowest
-priority, and puts its metrics into results/runs/NAME.csv every few minutes and 50 evaluation
-episodes of its end into NAME-evaluation.json. What is done is not run again. SIGTERM or Ctrl-C
-saves the runs; the same command continues them. `--list` names them and what has been done. Run it
-in a clone that nothing else changes: an edit would change the runs.
+Trains the missing runs of the named groups, `--jobs` at a time, each on one thread at the lowest
+priority. Copies their metrics to results/runs/NAME.csv every two minutes; at a run's end, writes 50
+evaluation episodes to NAME-evaluation.json. Finished runs are not repeated. SIGTERM or Ctrl-C saves
+the runs; the same command resumes them. `--list` lists the runs and their progress. Start it in a
+clone that nobody edits: an edit would change the runs.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ COPY_EVERY = 120.0
 BOXES = ("move_box", "lift_box")
 STATE_AGENTS = ("merl_state", "ddpg", "sac")
 LAPTOP = "--preset laptop --num-envs 1 --synchronous --agent.precision bf16"
-"""With one environment that the learner waits for: such a run can be repeated bit for bit."""
+"""One environment in turn with the learner, so that a run can be repeated bit for bit."""
 STATE = "--preset state"
 REACH_STEPS, BOX_STEPS = 300_000, 1_000_000
 
 
 def figure2() -> Iterator[tuple[str, str]]:
-    """Every agent on reach_duplo; those that are told the state, with preset state."""
+    """Yield every agent on reach_duplo; agents that observe the state have preset state."""
     for agent in ("merl", "drqv2", "proprio", *STATE_AGENTS):
         preset = STATE if agent in STATE_AGENTS else LAPTOP
         noise = f" --agent.noise-steps {REACH_STEPS // 2}" if agent == "drqv2" else ""
@@ -47,7 +47,7 @@ def figure2() -> Iterator[tuple[str, str]]:
 
 
 def figures3and5() -> Iterator[tuple[str, str]]:
-    """MERL on reach_duplo with one thing changed; the unchanged one is of figure2."""
+    """Yield MERL on reach_duplo with one change each; figure2 has MERL without a change."""
     changes = {
         "shared": "--agent.fusion shared",
         "shared-by-both": "--agent.fusion shared_by_both",
@@ -65,7 +65,7 @@ def figures3and5() -> Iterator[tuple[str, str]]:
 
 
 def boxes() -> Iterator[tuple[str, str]]:
-    """MERL with six layers from camera and joints on the boxes, as the paper starts them."""
+    """Yield MERL with six layers, from camera and joints, on the box tasks with the default start."""
     for reward in ("staged", "paper"):
         for task in BOXES:
             yield (
@@ -75,7 +75,7 @@ def boxes() -> Iterator[tuple[str, str]]:
 
 
 def boxes_state() -> Iterator[tuple[str, str]]:
-    """The agents on the state, likewise, a million steps each."""
+    """Yield the agents that observe the state on the box tasks, a million steps each."""
     for reward in ("staged", "paper"):
         for task in BOXES:
             for agent in STATE_AGENTS:
@@ -87,7 +87,7 @@ def boxes_state() -> Iterator[tuple[str, str]]:
 
 
 def boxes_mixed() -> Iterator[tuple[str, str]]:
-    """Training starts mixed over three or all stages; evaluations start above the box."""
+    """Yield runs whose starts mix three or all stages; their evaluations start above the box."""
     for agent, preset in (("merl_state", STATE), ("merl", LAPTOP)):
         for stages in ("above around holding", "above around holding carrying"):
             for task in BOXES:
@@ -108,7 +108,7 @@ GROUPS = {
 
 
 class Queue:
-    """Runs that are missing, taken in order; those under way are stopped by `stop`."""
+    """Missing runs, started in order; `stop` ends the active ones."""
 
     def __init__(self, runs: list[tuple[str, str]]) -> None:
         self._runs = [run for run in runs if not evaluation(run[0]).exists()]
@@ -117,7 +117,7 @@ class Queue:
         self.stopping = False
 
     def work(self) -> None:
-        """Run one after the other."""
+        """Train and evaluate runs, one after the other, until none is left."""
         while True:
             with self._lock:
                 if self.stopping or not self._runs:
@@ -128,13 +128,13 @@ class Queue:
                 self._call(name, "evaluate", RUNS / name, "--episodes", "50")
 
     def stop(self) -> None:
-        """Have every run save and end."""
+        """Let all active runs save and end."""
         self.stopping = True
         for process in self._processes:
             process.terminate()
 
     def _call(self, name: str, command: str, *arguments: object) -> bool:
-        """Run merl at the lowest priority; returns whether it ended well."""
+        """Run merl at the lowest priority; return whether it succeeded."""
         RUNS.mkdir(parents=True, exist_ok=True)
         given = [str(argument) for argument in arguments]
         if command == "train":
@@ -153,7 +153,7 @@ class Queue:
             if self.stopping:
                 process.terminate()
         while process.poll() is None:
-            with_patience(process)
+            wait_for_end(process)
             copy(name)
         with self._lock:
             self._processes.remove(process)
@@ -161,8 +161,8 @@ class Queue:
         return process.returncode == 0 and not self.stopping
 
 
-def with_patience(process: subprocess.Popen[bytes]) -> None:
-    """Wait for its end, COPY_EVERY seconds at most."""
+def wait_for_end(process: subprocess.Popen[bytes]) -> None:
+    """Wait until a process ends, for at most COPY_EVERY seconds."""
     try:
         process.wait(COPY_EVERY)
     except subprocess.TimeoutExpired:
@@ -170,12 +170,12 @@ def with_patience(process: subprocess.Popen[bytes]) -> None:
 
 
 def evaluation(name: str) -> Path:
-    """Where the episodes of a run's end are kept."""
+    """Return the file for the evaluation at the end of a run."""
     return DATA / f"{name}-evaluation.json"
 
 
 def copy(name: str) -> None:
-    """Keep a run's rows."""
+    """Copy the metrics of a run to the results."""
     metrics = RUNS / name / "metrics.csv"
     if metrics.exists():
         DATA.mkdir(parents=True, exist_ok=True)
@@ -183,7 +183,7 @@ def copy(name: str) -> None:
 
 
 def steps(name: str) -> int:
-    """Steps that a run has logged."""
+    """Return the number of steps that a run has logged."""
     path = DATA / f"{name}.csv"
     if not path.exists():
         return 0
@@ -192,20 +192,20 @@ def steps(name: str) -> int:
 
 
 def main() -> None:
-    """Run what is missing."""
+    """Train the missing runs, or list all runs."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("groups", nargs="*", choices=[*GROUPS, []], help="all, if none is named")
+    parser.add_argument("groups", nargs="*", choices=[*GROUPS, []], help="default: all")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
-    parser.add_argument("--list", action="store_true", help="name the runs, and what is done")
-    asked = parser.parse_args()
+    parser.add_argument("--list", action="store_true", help="list the runs and their progress")
+    options = parser.parse_args()
     runs = [
         (f"{name}-s{seed}", f"{arguments} --seed {seed}")
-        for seed in asked.seeds
-        for group in asked.groups or GROUPS
+        for seed in options.seeds
+        for group in options.groups or GROUPS
         for name, arguments in GROUPS[group]()
     ]
-    if asked.list:
+    if options.list:
         for name, arguments in runs:
             state = "done" if evaluation(name).exists() else f"{steps(name):,} steps"
             print(f"{name:40} {state:>16}  merl train {arguments}")
@@ -213,12 +213,12 @@ def main() -> None:
     queue = Queue(runs)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: queue.stop())
-    threads = [threading.Thread(target=queue.work) for _ in range(asked.jobs)]
+    threads = [threading.Thread(target=queue.work) for _ in range(options.jobs)]
     for thread in threads:
         thread.start()
         time.sleep(1)
     while any(thread.is_alive() for thread in threads):
-        time.sleep(0.5)  # signals are taken here
+        time.sleep(0.5)  # Python handles signals here
 
 
 if __name__ == "__main__":

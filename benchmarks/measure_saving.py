@@ -1,7 +1,10 @@
-"""What saving costs: python benchmarks/measure_saving.py [--preset paper --task move_box].
+"""Measure the cost of checkpoints.
 
-A run that saves at every episode's end, with the networks and the pictures of its preset, and how
-long a save takes; at the default `--save-every` of 300 seconds, what share of the time that is.
+    python benchmarks/measure_saving.py [--preset paper --task move_box]
+
+Trains a run with the networks and images of its preset that saves at the end of every episode.
+Prints the duration of a save, and its share of the time at the default `--save-every` of 300
+seconds.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from merl.training.trainer import Trainer
 
 
 def main(preset: str = "laptop", task: str = "reach_duplo", steps: int = 3000) -> None:
-    """Train for so many steps, an update for every fiftieth, and print what a save took."""
+    """Train for `steps` steps, with an update every 50 steps; print the duration of a save."""
     taken: list[float] = []
     save = Saver.save
 

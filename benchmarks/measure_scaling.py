@@ -1,9 +1,11 @@
-"""How cost grows with batch, image, environments and replay.
+"""Measure how the cost grows with batch, image, environments and replay.
 
-Numbers go to results/scaling.csv, the picture to docs/images/scaling.png; `--questions` with
-nothing behind it draws what is there. All sizes of one question take turns, in rounds, but for
-replays; wall-clock time, so leave the machine alone. The updates are the paper's (six layers) in
-bf16, on all cores.
+    python benchmarks/measure_scaling.py [--repeats 7] [--questions batch image]
+
+Writes the numbers to results/scaling.csv and the figure to docs/images/scaling.png; `--questions`
+without a value only draws. All sizes of one question take turns within each round; replays do not.
+The times are wall-clock time, so the machine must be idle. The updates are the paper's (six layers)
+in bf16, on all cores.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, 
 from merl.training.timing import use_threads
 
 ROOT = Path(__file__).resolve().parent.parent
-CSV, PICTURE = ROOT / "results/scaling.csv", ROOT / "docs/images/scaling.png"
+CSV, FIGURE = ROOT / "results/scaling.csv", ROOT / "docs/images/scaling.png"
 FIELDS = ("question", "side", "x", "median", "low", "high")
 BATCHES = (16, 32, 64, 128, 256, 512)
 SIDES = (32, 48, 64, 84, 100, 128)
@@ -51,7 +53,7 @@ ENVIRONMENTS = (1, 2, 3, 4)
 CAPACITIES = (1000, 10_000, 100_000, 300_000, 1_000_000, 1_500_000)
 PAD = 4
 SAMPLES = 20
-"""Batches of a turn, where a replay is sampled."""
+"""Batches in a turn when a replay is sampled."""
 EPISODE = 250
 ACTION_SPACE = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
 
@@ -71,9 +73,9 @@ def main(
     """Measure, then draw.
 
     Args:
-        repeats: rounds.
-        questions: what is asked; of the others what was measured before stays. None draws only.
-        place: a folder on the disk that replays are to lie on; temporary files' if not set.
+        repeats: number of rounds.
+        questions: questions to measure; the numbers of the others are kept. Empty: only draw.
+        place: a folder on the disk for the replays; by default the folder for temporary files.
     """
     ask = {"batch": batches, "image": sides, "environments": environments}
     print(circumstances())
@@ -92,13 +94,13 @@ def main(
 
 
 def batches(repeats: int) -> Iterator[Row]:
-    """Milliseconds of an update, by the samples in it."""
+    """Yield the milliseconds of an update, by batch size."""
     works = {("update", size): _update(size, 84) for size in BATCHES}
     yield from _rows("batch", works, repeats)
 
 
 def sides(repeats: int) -> Iterator[Row]:
-    """Milliseconds of an update of 128 samples and of an environment's step, by picture."""
+    """Yield the milliseconds of an update (batch 128) and of an environment step, by image size."""
     works: dict[tuple[str, int], Work] = {}
     with ExitStack() as stack:
         for side in SIDES:
@@ -111,7 +113,7 @@ def sides(repeats: int) -> Iterator[Row]:
 
 
 def environments(repeats: int) -> Iterator[Row]:
-    """Steps a second of the whole loop of preset laptop, by environments beside the learner."""
+    """Yield the steps per second of preset laptop's training loop, by environments at once."""
     ways: dict[tuple[str, int], dict[str, Any]] = {("strict", 1): {}}
     for count in ENVIRONMENTS:
         ways["beside the learner", count] = {"synchronous": False, "num_envs": count}
@@ -121,17 +123,17 @@ def environments(repeats: int) -> Iterator[Row]:
 
 
 def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
-    """Milliseconds to sample and shift 256 pairs, by the steps held; each replay by itself.
+    """Yield the milliseconds to sample and shift 256 pairs, by capacity; one replay at a time.
 
-    Also those that do not fit into memory, which merl refuses: check and reading ahead are taken
-    away here to show what they are for.
+    This includes replays that do not fit into memory, which merl refuses: the check is switched off
+    here, and reading ahead in one variant, to show their effect.
     """
-    seen = _arm()
+    seen = _episode()
     for compress, capacity in product((False, True), CAPACITIES):
         config = ReplayConfig(capacity=capacity, compress=compress)
         with tempfile.TemporaryDirectory(dir=place) as folder, patch.object(ring, "check_fits"):
             if replay_bytes(config, space_of(), ACTION_SPACE) > 0.9 * free_disk(Path(folder)):
-                print(f"{capacity:,} steps are left out: the disk is too small")
+                print(f"{capacity:,} steps are skipped: the disk is too small")
                 continue
             replay = EpisodeRing(
                 config, space_of(), ACTION_SPACE, directory=Path(folder) / "replay"
@@ -142,7 +144,7 @@ def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
             sample = partial(_samples, replay, rng)
             works: dict[tuple[str, int], Work] = {(name, capacity): sample}
             if not compress:
-                works["raw, not read ahead", capacity] = partial(_as_touched, sample)
+                works["raw, not read ahead", capacity] = partial(_without_read_ahead, sample)
             for (side, x), each in take_turns(works, repeats).items():
                 yield _row("replay", side, x, [1e3 * seconds / SAMPLES for seconds in each])
 
@@ -154,7 +156,7 @@ def _samples(replay: EpisodeRing, rng: np.random.Generator) -> None:
         replay.sample(256, rng, {"image": now}, {"image": then})
 
 
-def _as_touched(sample: Work) -> None:
+def _without_read_ahead(sample: Work) -> None:
     with patch.object(pictures.ReadAhead, "is_wanted", False):
         sample()
 
@@ -165,8 +167,8 @@ def _rows(question: str, works: Mapping[tuple[str, int], Work], repeats: int) ->
 
 
 def _row(question: str, side: str, x: int, values: list[float]) -> Row:
-    told = spread(values)
-    return question, side, x, told["median"], told["low"], told["high"]
+    result = spread(values)
+    return question, side, x, result["median"], result["low"], result["high"]
 
 
 def _update(size: int, side: int) -> Work:
@@ -174,8 +176,8 @@ def _update(size: int, side: int) -> Work:
     return partial(agent.update, noise_batch(size, side))
 
 
-def _arm() -> list[dict[str, Any]]:
-    """What an arm that is moved at random sees in an episode."""
+def _episode() -> list[dict[str, Any]]:
+    """Return the observations of an episode with random actions."""
     env = make_env("reach_duplo", renderer="raster")
     observation, _ = env.reset(seed=0)
     seen = [observation]
@@ -195,7 +197,7 @@ def _fill(ring: EpisodeRing, seen: list[dict[str, Any]], steps: int) -> None:
 
 
 def draw() -> None:
-    """A panel for each question."""
+    """Draw the figure, one panel per question."""
     with CSV.open() as file:
         rows = list(csv.DictReader(file))
     figure = new_figure(6.4)
@@ -214,8 +216,8 @@ def draw() -> None:
         panels[1, 0], rows, "environments", "steps a second", "environments", xlog=False, ylog=False
     )
     _panel(panels[1, 1], rows, "replay", "ms for 256 pairs", "steps held", xlog=True, ylog=True)
-    save(figure, PICTURE)
-    print(f"{PICTURE} ({DPI} dpi)")
+    save(figure, FIGURE)
+    print(f"{FIGURE} ({DPI} dpi)")
 
 
 def _panel(
@@ -252,7 +254,7 @@ def _panel(
     ticks = sorted({int(row["x"]) for row in mine})
     if xlog:
         axes.set_xscale("log")
-        near = 0.08 * np.log(ticks[-1] / ticks[0])  # so near to the one before, labels overlap
+        near = 0.08 * np.log(ticks[-1] / ticks[0])  # labels that are nearer overlap
         apart = np.diff(np.log(ticks), prepend=-np.inf) > near
         ticks = [tick for tick, keep in zip(ticks, apart, strict=True) if keep]
     axes.xaxis.set_major_locator(FixedLocator(ticks))

@@ -1,6 +1,8 @@
-"""The small tasks over seeds, a row per evaluation: benchmarks/measure_small_tasks.py [SEEDS].
+"""Train on the small tasks with several seeds; write one row per evaluation.
 
-A run that `results/small_tasks.csv` has to its end is not measured again.
+    python benchmarks/measure_small_tasks.py [SEEDS]
+
+Runs that are complete in `results/small_tasks.csv` are not repeated.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from merl.core.statistics import bootstrap_interval
 from merl.experiments.small_tasks import CASES, WHOLE, Case, learn, optimum, returns_of
 from merl.report.curves import read_metrics
 
-EVALUATIONS = 10  # of a run, the last one at its end
+EVALUATIONS = 10  # per run; the last one is at its end
 OUTPUT = Path(__file__).resolve().parent.parent / "results/small_tasks.csv"
 COLUMNS = {"step": "step", "return": "eval/return"} | {
     end: f"eval/return_{end}" for end in ("low", "high")
@@ -25,7 +27,7 @@ FIELDS = ("task", "agent", "precision", "seed", *COLUMNS)
 
 
 def main() -> None:
-    """Measure what is missing, then print the means."""
+    """Train the missing runs, then print the means."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     rows = _read()
     for case in CASES:
@@ -40,9 +42,11 @@ def main() -> None:
     print(f"the dot: straight to the mark {best:.2f}, standing still {still:.2f}")
     for case in CASES:
         this = _named(case) | {"step": str(case.steps)}
-        told = [float(row["return"]) for row in rows if row == row | this]
-        mean, low, high = bootstrap_interval(told)
-        print(f"{' '.join(map(str, case))} steps: {mean:.2f} [{low:.2f}, {high:.2f}]", sorted(told))
+        returns = [float(row["return"]) for row in rows if row == row | this]
+        mean, low, high = bootstrap_interval(returns)
+        print(
+            f"{' '.join(map(str, case))} steps: {mean:.2f} [{low:.2f}, {high:.2f}]", sorted(returns)
+        )
 
 
 def _named(case: Case) -> dict[str, str]:
@@ -50,7 +54,7 @@ def _named(case: Case) -> dict[str, str]:
 
 
 def measured(case: Case, seed: int) -> list[dict[str, str]]:
-    """Every evaluation of one run."""
+    """Train one run; return a row for each of its evaluations."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         learn(case, seed=seed, run_dir=run, evaluations=EVALUATIONS)

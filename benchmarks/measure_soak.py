@@ -1,10 +1,11 @@
-"""A run that is killed again and again, and whether it loses anything or grows.
+"""Kill a run repeatedly; check that its checkpoints stay, record lost steps and memory.
 
     python benchmarks/measure_soak.py                                  # two hours
     python benchmarks/measure_soak.py --minutes 10 --flags="--num-envs 2"  # flags of `merl train`
 
-It trains with the environment in a process of its own, is killed (SIGKILL) every one to five
-minutes, and goes on with the same line. A row for each stretch is written to results/soak.csv.
+The run trains with the environment in a worker process, is killed (SIGKILL) every one to five
+minutes, and resumes with the same command. results/soak.csv gets a row for each segment between two
+kills.
 """
 
 from __future__ import annotations
@@ -41,15 +42,15 @@ def main(
     flags: str = "",
     output: Path = OUTPUT,
 ) -> None:
-    """Soak, tell of each stretch, and sum up.
+    """Run the test; write and print a row for each segment, then print a summary.
 
     Args:
-        minutes: in all.
-        least: seconds until a kill.
-        most: seconds until a kill.
-        task: what is trained on.
-        flags: of `merl train`, after those of a laptop.
-        output: where the rows go.
+        minutes: total duration.
+        least: smallest number of seconds until a kill.
+        most: largest number of seconds until a kill.
+        task: the task to train on.
+        flags: further flags of `merl train`, after `FLAGS`.
+        output: the CSV file for the rows.
     """
     with tempfile.TemporaryDirectory() as folder, output.open("w", newline="") as file:
         run = Path(folder) / "run"
@@ -57,35 +58,35 @@ def main(
         writer = csv.writer(file)
         writer.writerow(["seconds", "step", "lost_steps", "memory_begin_mb", "memory_end_mb"])
 
-        def tell(stretch: Stretch) -> None:
-            begin, end = (round(size / 1e6, 1) for size in stretch.memory)
-            row = (round(stretch.seconds), stretch.step, stretch.lost_steps, begin, end)
+        def report(segment: Segment) -> None:
+            begin, end = (round(size / 1e6, 1) for size in segment.memory)
+            row = (round(segment.seconds), segment.step, segment.lost_steps, begin, end)
             writer.writerow(row)
             file.flush()
             print(*row, flush=True)
 
-        stretches = soak(line, run, 60 * minutes, (least, most), tell)
+        segments = soak(line, run, 60 * minutes, (least, most), report)
         steps = read_metrics(run)["step"]
     if (np.diff(steps) < 0).any():
-        raise SystemExit("steps in the metrics go back")
-    ends = [stretch.memory[1] / 1e6 for stretch in stretches]
+        raise SystemExit("the steps in the metrics are not ascending")
+    ends = [segment.memory[1] / 1e6 for segment in segments]
     print(
-        f"{len(stretches)} kills, {stretches[-1].step:,} steps, at most "
-        f"{max(stretch.lost_steps for stretch in stretches)} steps lost at once, "
+        f"{len(segments)} kills, {segments[-1].step:,} steps, at most "
+        f"{max(segment.lost_steps for segment in segments)} steps lost per kill, "
         f"memory {min(ends):.0f} to {max(ends):.0f} MB"
     )
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """From one start to the next kill.
+class Segment:
+    """The part of a run from a start to the next kill.
 
     Attributes:
-        seconds: that it lasted.
-        step: of the last checkpoint at its end.
-        lost_steps: logged after that checkpoint, and taken again in the next stretch.
-        memory: resident bytes of the process and its children that are no shared file pages, at
-            the beginning and at the end of training.
+        seconds: duration.
+        step: step of the last checkpoint at the kill.
+        lost_steps: steps that were logged after that checkpoint; the next segment repeats them.
+        memory: resident bytes of the process and its children without shared file pages, at the
+            beginning and at the end of training.
     """
 
     seconds: float
@@ -99,24 +100,25 @@ def soak(
     run: Path,
     seconds: float,
     between: tuple[float, float],
-    tell: Callable[[Stretch], None],
-) -> list[Stretch]:
-    """Train for so many seconds with a kill -9 at random moments, then to the end of an episode.
+    report: Callable[[Segment], None],
+) -> list[Segment]:
+    """Train for `seconds`, and kill the process (SIGKILL) at random times.
 
     Args:
-        line: of `merl`, with `--resume` and the run's folder; of a run too long to come to its end.
-        run: the folder.
-        seconds: in all.
-        between: the least and the most seconds until a kill.
-        tell: is told each stretch.
+        line: arguments of `merl`, with `--resume` and the run's folder, for a run that does not end
+            within this time.
+        run: the run's folder.
+        seconds: total duration.
+        between: smallest and largest number of seconds until a kill.
+        report: called with each segment.
 
     Raises:
-        SystemExit: the run ended by itself, or lost what a checkpoint had.
+        SystemExit: the run ended by itself, or lost steps that were in a checkpoint.
     """
-    moment, stretches = random.Random(0), list[Stretch]()
+    rng, segments = random.Random(0), list[Segment]()
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        begun, lasts = time.monotonic(), moment.uniform(*between)
+        begun, lasts = time.monotonic(), rng.uniform(*between)
         process = subprocess.Popen(
             [sys.executable, "-m", "merl.cli", *line],
             stdout=subprocess.DEVNULL,
@@ -126,32 +128,32 @@ def soak(
         memory: list[int] = []
         while time.monotonic() - begun < lasts:
             if process.poll() is not None:
-                _, said = process.communicate()
-                raise SystemExit(f"the run ended by itself with {process.returncode}: {said}")
+                _, error = process.communicate()
+                raise SystemExit(f"the run ended by itself with {process.returncode}: {error}")
             memory.append(_private_bytes(process.pid))
             time.sleep(min(1.0, lasts / 20))
         _kill_all(process)
         step = _saved(run)
-        if stretches and step < stretches[-1].step:
-            raise SystemExit(f"step {stretches[-1].step} was saved, but now it stands at {step}")
+        if segments and step < segments[-1].step:
+            raise SystemExit(f"step {segments[-1].step} was saved, but the run is at step {step}")
         logged = read_metrics(run)["step"] if (run / METRICS_FILE).exists() else np.array([step])
         reached = int(np.max(logged, initial=step))
-        half = memory[len(memory) // 2 :]  # after the start, with its measurements
+        half = memory[len(memory) // 2 :]  # without the start, which takes measurements
         first, last = half[: len(half) // 4 + 1], half[-(len(half) // 4 + 1) :]
-        stretches.append(
-            Stretch(
+        segments.append(
+            Segment(
                 time.monotonic() - begun,
                 step,
                 max(0, reached - step),
                 (int(np.median(first)), int(np.median(last))),
             )
         )
-        tell(stretches[-1])
-    return stretches
+        report(segments[-1])
+    return segments
 
 
 def _saved(run: Path) -> int:
-    """The step of the last checkpoint; 0 of a run that was killed before its first one."""
+    """Return the step of the last checkpoint; 0 if there is none yet."""
     try:
         return Checkpoint.find(Run.open(run).checkpoints).step
     except MerlError:
@@ -159,7 +161,7 @@ def _saved(run: Path) -> int:
 
 
 def _kill_all(process: subprocess.Popen[str]) -> None:
-    """The process alone is killed; its workers are to end by themselves."""
+    """Kill the process, and check that its workers end by themselves within 30 s."""
     children = psutil.Process(process.pid).children(recursive=True)
     process.kill()
     process.communicate()
@@ -169,7 +171,7 @@ def _kill_all(process: subprocess.Popen[str]) -> None:
 
 
 def _private_bytes(pid: int) -> int:
-    """Resident memory that is no page of a mapped file: the replay's are the system's to drop."""
+    """Return resident bytes without mapped files, such as the replay: the system may drop them."""
     try:
         whole = psutil.Process(pid)
         infos = [p.memory_info() for p in (whole, *whole.children(recursive=True))]

@@ -1,4 +1,4 @@
-"""What every test shares; and the rule that no test is skipped in silence."""
+"""Fixtures of all tests, and the rule that a skip needs a listed reason."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-# For the processes that tests start: two test processes share two cores, and what a command prints
-# must not depend on the terminal that the tests are run in.
+# Environment of the processes that tests start: they share the cores with other tests, and their
+# output must not depend on the terminal.
 os.environ |= {"OMP_NUM_THREADS": "1", "COLUMNS": "80", "LINES": "25", "TERM": "xterm"}
 for _name in ("FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
     os.environ.pop(_name, None)
@@ -20,14 +20,14 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 ALLOWED_SKIPS = (
     r"no OpenGL library works on this machine",
     r"this machine has CUDA",
-    r"this system lets nobody mount a disk of their own",
+    r"this system does not allow users to mount a disk",
 )
-"""Reasons, as regular expressions, for which a test may be skipped; any other skip is a failure."""
+"""Regular expressions of the allowed reasons to skip a test; any other skip is a failure."""
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _records_of_their_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The records of trained runs, which a user has in the home folder."""
+def _temporary_run_records(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the records of trained runs in a temporary folder, not in the home folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -35,7 +35,7 @@ def _records_of_their_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
-    """Tests share two cores and small tensors: threads would only get in each other's way."""
+    """Use one thread: tests run in parallel on small tensors, so more threads are slower."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -44,7 +44,7 @@ def _one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _no_signal_is_ignored() -> Iterator[None]:
-    """Merl heeds no signal that it was started to ignore: as under nohup, and in the background."""
+    """Reset ignored signals (nohup, background jobs), since merl leaves them ignored."""
     ignored = [number for number in SIGNALS if signal.getsignal(number) == signal.SIG_IGN]
     for number in ignored:
         is_ctrl_c = number == signal.SIGINT
@@ -65,7 +65,7 @@ def pytest_make_collect_report(collector: pytest.Collector):
 
 
 def _checked(report):
-    """The report; a failure if it is a skip for a reason that is not on the list."""
+    """Return the report, as a failure if it is a skip without an allowed reason."""
     if report.skipped and not hasattr(report, "wasxfail"):
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
         if not any(re.search(allowed, reason) for allowed in ALLOWED_SKIPS):

@@ -1,4 +1,4 @@
-"""A task without an environment around it, for the tests of tasks and experts."""
+"""Episodes of a task without an environment, for the tests of tasks and experts."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from merl.tasks import jaco, make_task
 
 
 class Episodes:
-    """A task, started in the way of `JacoEnv`: one physics for all episodes."""
+    """A task, started as in `JacoEnv`: one physics for all episodes."""
 
     def __init__(self, name, occluded=False, **form):
         self.name, self.occluded = name, occluded
@@ -19,10 +19,10 @@ class Episodes:
 
 
 def check_starts(episodes, seeds, resting_height):
-    """Each start lies within its box, at rest, and the robot touches nothing.
+    """Check that each start is in its region and at rest, and that the robot touches nothing.
 
     Returns:
-        The object's yaw, rad, and how far the fingers are closed, of each start.
+        For each start, the object's yaw, rad, and the closed fraction of the fingers.
     """
     task = episodes.task
     yaws, closures = [], []
@@ -47,6 +47,6 @@ def check_starts(episodes, seeds, resting_height):
 
 
 def check_uniform(yaws, closures):
-    """500 yaws and closures, a hundred of which are expected in each fifth of their range."""
+    """Check 500 yaws and closures: about 100 of them must be in each fifth of their range."""
     for share in (yaws / (2 * np.pi), closures):
         assert np.histogram(share, bins=5, range=(0, 1))[0].min() > 60

@@ -1,4 +1,4 @@
-"""What several tests need to read output and to wait for a run."""
+"""Helpers of several tests: read output, and wait for a run."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from collections.abc import Callable
 
 
 def flat(text: str) -> str:
-    """The text with single spaces, so that it does not matter where a terminal wraps its lines."""
+    """Return the text with single spaces, so that line wraps of a terminal do not matter."""
     return " ".join(text.split())
 
 
-def wait_for(happens: Callable[[], object], process: subprocess.Popen[str] | None = None) -> None:
-    """Wait until `happens()` is true.
+def wait_for(condition: Callable[[], object], process: subprocess.Popen[str] | None = None) -> None:
+    """Wait until `condition()` is true.
 
     Args:
-        happens: asked again and again.
-        process: what is waited for happens in it: its end is a failure.
+        condition: called repeatedly.
+        process: the process that makes the condition true; its end is a failure.
 
     Raises:
-        AssertionError: the process ended before it happened, or nothing happened for five minutes,
-            which a busy machine does not need.
+        AssertionError: the process ended before the condition was true, or the condition was not
+            true within five minutes, which is long enough on a busy machine.
     """
     deadline = time.monotonic() + 300
-    while not happens():
-        if process is not None and process.poll() is not None and not happens():
+    while not condition():
+        if process is not None and process.poll() is not None and not condition():
             raise AssertionError(f"the process ended with exit code {process.returncode}")
-        assert time.monotonic() < deadline, "it took too long"
+        assert time.monotonic() < deadline, "the condition was not true within five minutes"
         time.sleep(0.01)

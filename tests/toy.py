@@ -1,4 +1,4 @@
-"""A tiny world for tests: a dot on a line, seen by a camera, felt by a joint."""
+"""A small environment for tests: a dot on a line, with a camera image and a joint vector."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 
 class DotEnv(gymnasium.Env[dict[str, Any], Any]):
-    """The dot at x in [-1, 1] moves by the action; the reward is 1 - |x|; 10 steps an episode."""
+    """The action moves a dot at x in [-1, 1]; the reward is 1 - |x|; 10 steps per episode."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
     length = 10

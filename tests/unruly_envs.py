@@ -1,4 +1,4 @@
-"""Environments of a few lines that misbehave in a run; the tests choose how by `unruly`."""
+"""Small environments that misbehave in a run; tests set the behaviour in `unruly`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ unruly = SimpleNamespace(**DEFAULT)
 
 
 class Unruly(gymnasium.Env[Any, Any]):
-    """Three numbers, drawn anew at each step; the reward is the first."""
+    """An observation of three equal random numbers; the reward is the first one."""
 
     def __init__(self, render_mode: str | None = None) -> None:
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -71,7 +71,7 @@ made: list[Unruly] = []
 
 
 def one() -> Unruly:
-    """The same object every time, as one device is."""
+    """Return the same object every time, like a single physical device."""
     if not made:
         made.append(Unruly())
     return made[0]
@@ -82,7 +82,7 @@ def wanders() -> Unruly:
     return make()
 
 
-# What `draw` can be.
+# Values of `draw`.
 
 
 def from_numpy(env: Unruly) -> float:
@@ -97,7 +97,7 @@ def from_own_generator(env: Unruly) -> float:
     return float(env.rng.normal())  # type: ignore[attr-defined]
 
 
-# What `in_training` and `in_evaluation` can be.
+# Values of `in_training` and `in_evaluation`.
 
 
 def fail(env: Unruly, seen: Any) -> Any:
@@ -113,7 +113,7 @@ def give_nan(env: Unruly, seen: Any) -> Any:
 
 
 def interrupted(number: int, error: BaseException) -> Any:
-    """At the 15th step of the process the signal comes, and the simulator raises because of it."""
+    """Send a signal at the fifth step after the third or a later reset, then raise `error`."""
 
     def act(env: Unruly, seen: Any) -> Any:
         if len(env.starts) > 2 and env.taken == 5:
@@ -125,7 +125,7 @@ def interrupted(number: int, error: BaseException) -> Any:
 
 
 def takes_over_signals(env: Unruly, seen: Any) -> Any:
-    """Installs a handler at every step, and Ctrl-C comes while it is there."""
+    """Install a handler at every step, and send Ctrl-C while it is installed."""
     signal.signal(signal.SIGINT, lambda *_: None)
     if len(env.starts) > 2 and env.taken == 5:
         os.kill(os.getpid(), signal.SIGINT)

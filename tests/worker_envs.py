@@ -1,4 +1,4 @@
-"""Environments that misbehave in processes of their own, told how by environment variables."""
+"""Environments that misbehave in worker processes; environment variables control how."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ import numpy as np
 from gymnasium import spaces
 
 EPISODE = 10
+"""Steps of an episode."""
 WORK = 0.02
 """Seconds that a step of `Slow` takes."""
 
 
 class Plain(gymnasium.Env[Any, Any]):
-    """A number per dimension, drawn by its own generator; the reward is the first one."""
+    """Three random numbers from Gymnasium's generator; the reward is the first one."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -27,27 +28,35 @@ class Plain(gymnasium.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.taken = 0
-        return self._seen(), {}
+        return self._observation(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.taken += 1
-        seen = self._seen()
-        info = {"success": seen[0] > 0, "reward_terms": {"first": float(seen[0])}, "else": object()}
-        return seen, float(seen[0]), False, self.taken == EPISODE, info
+        observation = self._observation()
+        info = {
+            "success": observation[0] > 0,
+            "reward_terms": {"first": float(observation[0])},
+            "else": object(),
+        }
+        return observation, float(observation[0]), False, self.taken == EPISODE, info
 
-    def _seen(self) -> Any:
+    def _observation(self) -> Any:
         return self.np_random.normal(size=3).astype(np.float32)
 
 
 class Misbehaving(Plain):
-    """In a process of its own, at its 25th step: does `what`, as often as `TIMES` says."""
+    """In a worker process: dies, stops or hangs at the 25th step, `TIMES` times in total."""
 
     def __init__(self, what: str) -> None:
-        self.what, self.all = what, 0
+        self.what, self.steps = what, 0
 
     def step(self, action: Any) -> Any:
-        self.all += 1
-        if self.all == 25 and multiprocessing.parent_process() is not None and self._is_my_turn():
+        self.steps += 1
+        if (
+            self.steps == 25
+            and multiprocessing.parent_process() is not None
+            and self._takes_a_turn()
+        ):
             if self.what == "dies":
                 os.kill(os.getpid(), signal.SIGKILL)
             if self.what == "stops":
@@ -55,7 +64,7 @@ class Misbehaving(Plain):
             time.sleep(1000)
         return super().step(action)
 
-    def _is_my_turn(self) -> bool:
+    def _takes_a_turn(self) -> bool:
         folder = Path(os.environ["TURNS"])
         for turn in range(int(os.environ["TIMES"])):
             try:
@@ -67,32 +76,32 @@ class Misbehaving(Plain):
 
 
 class Slow(Plain):
-    """Each step takes a while, without the processor."""
+    """Each step sleeps for `WORK` seconds."""
 
     def step(self, action: Any) -> Any:
         time.sleep(WORK)
         return super().step(action)
 
 
-class Beside(Plain):
-    """In a process of its own, a late step ends only once the learner learns beside it."""
+class WaitsForUpdate(Plain):
+    """In a worker process: from the 25th step on, each step waits for an update to start."""
 
     def __init__(self) -> None:
-        self.all = 0
+        self.steps = 0
 
     def step(self, action: Any) -> Any:
-        self.all += 1
-        if self.all >= 25 and multiprocessing.parent_process() is not None:
+        self.steps += 1
+        if self.steps >= 25 and multiprocessing.parent_process() is not None:
             deadline = time.monotonic() + 60
-            while not (Path(os.environ["TURNS"]) / f"learns-{self.all}").exists():
+            while not (Path(os.environ["TURNS"]) / f"learns-{self.steps}").exists():
                 if time.monotonic() > deadline:
-                    raise TimeoutError("nothing was learnt during this step")
+                    raise TimeoutError("no update started during this step")
                 time.sleep(0.001)
         return super().step(action)
 
 
 class Failing(Plain):
-    """Fails with an exception that another process cannot be told."""
+    """In a worker process: fails with an exception that cannot be pickled."""
 
     def step(self, action: Any) -> Any:
         class LocalError(Exception):
@@ -103,24 +112,24 @@ class Failing(Plain):
         return super().step(action)
 
 
-class Broken(Plain):
-    """The second one's reward is no number at its 25th step."""
+class NaNReward(Plain):
+    """In the second worker, the reward is NaN at the 25th step."""
 
     def __init__(self) -> None:
-        self.all, self.is_second = 0, multiprocessing.current_process().name.endswith("-1")
+        self.steps, self.is_second = 0, multiprocessing.current_process().name.endswith("-1")
 
     def step(self, action: Any) -> Any:
-        self.all += 1
-        seen, reward, *rest = super().step(action)
-        return (seen, np.nan if self.is_second and self.all == 25 else reward, *rest)
+        self.steps += 1
+        observation, reward, *rest = super().step(action)
+        return (observation, np.nan if self.is_second and self.steps == 25 else reward, *rest)
 
 
-def broken() -> Plain:
-    return Broken()
+def nan_reward() -> Plain:
+    return NaNReward()
 
 
-class Stillborn(Plain):
-    """Dies at its first reset, if it has a process of its own."""
+class DiesAtReset(Plain):
+    """In a worker process: dies at the first reset."""
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         if multiprocessing.parent_process() is not None:
@@ -128,26 +137,26 @@ class Stillborn(Plain):
         return super().reset(seed=seed)
 
 
-def stillborn() -> Plain:
-    return Stillborn()
+def dies_at_reset() -> Plain:
+    return DiesAtReset()
 
 
-class Uneven(Plain):
-    """What it tells changes in kind from step to step: a term is a whole number at times."""
+class MixedTypes(Plain):
+    """The type of its reward term changes between steps: float, or the integer 0."""
 
     def step(self, action: Any) -> Any:
-        seen, reward, terminated, truncated, _ = super().step(action)
+        observation, reward, terminated, truncated, _ = super().step(action)
         reward = max(reward, 0.0)
         info = {"reward_terms": {"first": reward if reward else 0}}
-        return seen, reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
 
-def uneven() -> Plain:
-    return Uneven()
+def mixed_types() -> Plain:
+    return MixedTypes()
 
 
 class NeverReady(Plain):
-    """Cannot be made in a process of its own: whoever waits for it waits."""
+    """In a worker process: its constructor does not return."""
 
     def __init__(self) -> None:
         if multiprocessing.parent_process() is not None:
@@ -155,15 +164,15 @@ class NeverReady(Plain):
             time.sleep(1000)
 
 
-class OfItsOwn(Plain):
-    """Leaves Gymnasium's generator alone."""
+class OwnGenerator(Plain):
+    """Uses its own random generator instead of Gymnasium's."""
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self.generator = np.random.default_rng(seed)
         self.taken = 0
-        return self._seen(), {}
+        return self._observation(), {}
 
-    def _seen(self) -> Any:
+    def _observation(self) -> Any:
         return self.generator.normal(size=3).astype(np.float32)
 
 
@@ -171,8 +180,8 @@ def never_ready() -> Plain:
     return NeverReady()
 
 
-def of_its_own() -> Plain:
-    return OfItsOwn()
+def own_generator() -> Plain:
+    return OwnGenerator()
 
 
 def fails() -> Plain:
@@ -187,8 +196,8 @@ def slow() -> Plain:
     return Slow()
 
 
-def beside() -> Plain:
-    return Beside()
+def waits_for_update() -> Plain:
+    return WaitsForUpdate()
 
 
 def dies() -> Plain:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from merl.agents import AGENTS
 from merl.agents.config import AgentConfig
-from merl.core import MerlError, check_choice, counted
+from merl.core import MerlError, check_choice, counted, suggest
 from merl.envs.config import EnvConfig, StartName, UserEnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
@@ -79,8 +80,8 @@ class TrainConfig:
     steps: int = 1_000_000
     """Number of environment steps."""
     measure: bool = False
-    """Time your own environment with 75 random steps before the run starts, as merl does for its own
-    tasks; if not set, the first steps of the run are timed."""
+    """Time your own environment with 75 random steps before the run starts, as merl always does for
+    its own tasks; if not set, the first steps of the run are timed."""
     minutes: float | None = None
     """Time limit of the run in minutes, since start or resume."""
     run_dir: Path | None = None
@@ -195,3 +196,35 @@ class TrainConfig:
     def capacity(self) -> int:
         """Return the capacity of the replay, at most the actions that the whole run takes."""
         return min(self.replay.capacity, math.ceil(self.steps / self.action_repeat))
+
+
+def override(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
+    """Return a config with other values.
+
+    Args:
+        config: a config.
+        values: {field: value}; the field of a nested config by its dotted name, e.g.
+            `agent.noise_std`. A `-` in a name counts as `_`.
+
+    Raises:
+        MerlError: a name is unknown, or a value cannot work.
+    """
+    changes: dict[str, Any] = {}
+    nested: dict[str, dict[str, Any]] = {}
+    names = [field.name for field in fields(config)]
+    for name, value in values.items():
+        first, _, rest = name.replace("-", "_").partition(".")
+        if first not in names or (rest and not is_dataclass(getattr(config, first))):
+            raise MerlError(f"config {name!r} is unknown: {suggest(first, names)}")
+        if rest:
+            nested.setdefault(first, {})[rest] = value
+        else:
+            changes[first] = value
+    for first, inner in nested.items():
+        part = changes.get(first, getattr(config, first))
+        known = [field.name for field in fields(part)]
+        for name in inner:
+            if name not in known:
+                raise MerlError(f"config {first}.{name!r} is unknown: {suggest(name, known)}")
+        changes[first] = replace(part, **inner)
+    return replace(config, **changes)

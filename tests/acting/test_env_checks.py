@@ -37,7 +37,7 @@ class MyNormalizer(wrappers.NormalizeObservation):  # type: ignore[misc]
 
 
 class RunningMeanStd:
-    """As other libraries call it."""
+    """A class with the name that other libraries use."""
 
 
 class TheirNormalizer(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -47,7 +47,7 @@ class TheirNormalizer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class Holding(Plain):
-    """An environment around another one, which is no wrapper of Gymnasium's."""
+    """An environment that holds another one but is not a Gymnasium wrapper."""
 
     def __init__(self, inner: Any) -> None:
         super().__init__()
@@ -74,14 +74,14 @@ def frozen(env: Any) -> Any:
         lambda: Holding(SyncVectorEnv([lambda: wrappers.NormalizeReward(Plain())])),
     ],
 )
-def test_running_statistics_are_refused_anywhere(make: Any) -> None:
+def test_running_statistics_are_refused_in_every_layer(make: Any) -> None:
     with pytest.raises(MerlError, match=r"--agent\.standardize") as refused:
         refuse_running_statistics(adapt(make()))
     assert "Normalize" in str(refused.value) or "MyNormalizer" in str(refused.value)
 
 
 class Keeping(Plain):
-    """Statistics that are no attribute, but lie in a dict, or in an object that is one."""
+    """An environment with statistics inside a container, e.g. a dict or an object."""
 
     def __init__(self, statistics: Any) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ def test_running_statistics_in_containers_are_refused(kept: Any) -> None:
 
 
 class SubtractsTheMean(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """The commonest running mean: after one observation it is that observation."""
+    """A wrapper with a simple running mean: after one observation, the mean is that observation."""
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
@@ -116,7 +116,7 @@ class SubtractsTheMean(gymnasium.ObservationWrapper[Any, Any, Any]):
         return (observation - self.mean).astype(np.float32)
 
 
-def test_a_running_mean_is_warned_of_at_the_start() -> None:
+def test_check_instances_warns_of_a_running_mean() -> None:
     with pytest.warns(UserWarning, match="after resets with the same seed differs"):
         check_instances(adapt(Plain()), adapt(SubtractsTheMean(Plain())))
 
@@ -136,23 +136,23 @@ HARMLESS = [
 
 
 @pytest.mark.parametrize("make", HARMLESS)
-def test_harmless_wrappers_pass_without_a_word(make: Any) -> None:
+def test_harmless_wrappers_pass_without_a_warning(make: Any) -> None:
     env, eval_env = adapt(make()), adapt(make())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         refuse_running_statistics(env)
         check_instances(env, eval_env)
-    assert eval_env.unwrapped.steps == 0  # nothing moves  # type: ignore[attr-defined]
+    assert eval_env.unwrapped.steps == 0  # no step was taken  # type: ignore[attr-defined]
 
 
 class Filter(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """A low-pass filter that nobody clears."""
+    """A low-pass filter that is not cleared by a reset."""
 
-    seen = 0.0
+    filtered = 0.0
 
     def observation(self, observation: Any) -> Any:
-        self.seen = np.float32(0.9) * self.seen + np.float32(0.1) * observation
-        return self.seen
+        self.filtered = np.float32(0.9) * self.filtered + np.float32(0.1) * observation
+        return self.filtered
 
 
 class Unseeded(Plain):
@@ -161,13 +161,13 @@ class Unseeded(Plain):
 
 
 @pytest.mark.parametrize("make", [lambda: Filter(Plain()), Unseeded])
-def test_first_observations_that_depend_on_the_past_are_warned_of(make: Any) -> None:
+def test_check_instances_warns_if_resets_with_one_seed_differ(make: Any) -> None:
     env = adapt(make())
     with pytest.warns(UserWarning, match="after resets with the same seed differs in 'state'"):
         check_instances(env, adapt(make()))
 
 
-def test_one_object_for_both_is_warned_of() -> None:
+def test_check_instances_warns_of_one_shared_object() -> None:
     robot = Plain()
     with pytest.warns(UserWarning, match="same environment object"):
         check_instances(adapt(robot), adapt(wrappers.TimeLimit(robot, 5)))

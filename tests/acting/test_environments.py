@@ -48,7 +48,7 @@ FOLDER = str(Path(__file__).parents[1])
 
 
 @pytest.fixture(autouse=True)
-def _findable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def _importable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.syspath_prepend(FOLDER)
     monkeypatch.setenv("PYTHONPATH", FOLDER, prepend=os.pathsep)
     monkeypatch.setenv("TURNS", str(tmp_path))
@@ -56,7 +56,7 @@ def _findable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def three(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A run with three environments in processes of their own, and what it printed."""
+    """Train a run with three worker environments; return its folder and its output."""
     run, out = tmp_path_factory.mktemp("three") / "run", StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out):
         patch.syspath_prepend(FOLDER)
@@ -67,7 +67,7 @@ def three(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 @contextmanager
 def started(run: Path, which: str, *flags: str) -> Iterator[subprocess.Popen[str]]:
-    """A run in a process of its own, which does not outlive the test."""
+    """Start a run in a new process that ends with the test at the latest."""
     line = ["train", f"worker_envs:{which}", *SMALL, "--run-dir", str(run), *flags]
     process = subprocess.Popen(
         [sys.executable, "-m", "merl.cli", *line],
@@ -100,7 +100,7 @@ def weights(run: Path) -> dict[str, object]:
 def test_a_run_with_workers_is_reproducible(
     tmp_path: Path, three: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hostile = tmp_path / "hostile"  # a working folder whose modules no process imports
+    hostile = tmp_path / "hostile"  # a working folder from which no process may import
     hostile.mkdir()
     for name in ("multiprocessing", "pickle", "numpy", "gymnasium"):
         (hostile / f"{name}.py").write_text("open('imported', 'w')")
@@ -110,14 +110,14 @@ def test_a_run_with_workers_is_reproducible(
     assert weights(tmp_path / "run") == weights(three[0])
 
 
-def test_a_run_beside_its_environment_is_reproducible_and_keeps_its_ratio(tmp_path: Path) -> None:
+def test_an_asynchronous_run_is_reproducible_and_keeps_its_update_ratio(tmp_path: Path) -> None:
     for run in ("one", "other"):
         assert train(tmp_path / run, "plain", "--no-synchronous", steps=120) == 0
         check_ratio(tmp_path / run, 120)
     assert weights(tmp_path / "one") == weights(tmp_path / "other")
 
 
-def test_a_run_with_workers_keeps_its_ratio(three: tuple[Path, str]) -> None:
+def test_a_run_with_workers_keeps_its_update_ratio(three: tuple[Path, str]) -> None:
     check_ratio(three[0], 150)
 
 
@@ -129,23 +129,25 @@ def check_ratio(run: Path, steps: int) -> None:
     np.testing.assert_allclose(metrics["train/reward/first"], metrics["train/return"], rtol=1e-6)
 
 
-def test_what_environments_tell_is_not_mixed(tmp_path: Path) -> None:
-    assert train(tmp_path / "run", "uneven", "--num-envs", "2") == 0
+def test_infos_of_several_environments_are_not_mixed(tmp_path: Path) -> None:
+    assert train(tmp_path / "run", "mixed_types", "--num-envs", "2") == 0
     metrics = read_metrics(tmp_path / "run")
     assert np.nanmin(metrics["train/return"]) > 0
     np.testing.assert_allclose(metrics["train/reward/first"], metrics["train/return"], rtol=1e-6)
 
 
-def test_each_worker_meets_other_episodes_and_has_a_ring_of_its_own(
+def test_each_worker_has_different_episodes_and_its_own_ring(
     three: tuple[Path, str],
 ) -> None:
-    seen = [
+    states = [
         np.fromfile(three[0] / f"replay/{ring}/observation.state.bin", np.float32)
         for ring in range(3)
     ]
-    assert all(np.count_nonzero(ring) >= 3 * 50 for ring in seen)
+    assert all(np.count_nonzero(ring) >= 3 * 50 for ring in states)
     for one, other in ((0, 1), (0, 2), (1, 2)):
-        assert not np.intersect1d(seen[one][seen[one] != 0], seen[other][seen[other] != 0]).size
+        assert not np.intersect1d(
+            states[one][states[one] != 0], states[other][states[other] != 0]
+        ).size
 
 
 @pytest.mark.parametrize(
@@ -155,10 +157,8 @@ def test_each_worker_meets_other_episodes_and_has_a_ring_of_its_own(
         pytest.param(("--no-synchronous",), marks=pytest.mark.long),
     ],
 )
-def test_a_run_with_workers_goes_on_as_if_it_had_not_stopped(
-    tmp_path: Path, flags: tuple[str, ...]
-) -> None:
-    """Its environments end their episodes together, so a checkpoint lies between episodes."""
+def test_a_run_with_workers_resumes_bit_exactly(tmp_path: Path, flags: tuple[str, ...]) -> None:
+    """All environments end their episodes at the same step, so a checkpoint is between episodes."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert train(whole, "plain", *flags, steps=160) == 0
     with started(parts, "plain", "--steps", "160", *flags) as process:
@@ -167,47 +167,49 @@ def test_a_run_with_workers_goes_on_as_if_it_had_not_stopped(
     assert weights(whole) == weights(parts)
 
 
-@pytest.mark.parametrize("how", ["dies", "hangs", pytest.param("stops", marks=pytest.mark.long)])
-def test_a_worker_that_is_lost_is_started_again(
-    tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    "failure", ["dies", "hangs", pytest.param("stops", marks=pytest.mark.long)]
+)
+def test_a_lost_worker_is_restarted(
+    tmp_path: Path, failure: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("TIMES", "1")
-    # On a busy machine one that only is slow must not seem to hang.
-    flags = ["--num-envs", "2", "--worker-timeout", "600" if how == "dies" else "5"]
-    assert train(tmp_path / "run", how, *flags) == 0
-    said = flat(capfd.readouterr().out)
-    assert "starting the environments again (restart 1 of 10)" in said
+    # On a busy machine a slow worker must not seem to hang.
+    flags = ["--num-envs", "2", "--worker-timeout", "600" if failure == "dies" else "5"]
+    assert train(tmp_path / "run", failure, *flags) == 0
+    printed = flat(capfd.readouterr().out)
+    assert "starting the environments again (restart 1 of 10)" in printed
     metrics = read_metrics(tmp_path / "run")
     assert np.nanmax(metrics["workers/restarts"]) == 1
-    assert np.nanmax(metrics["train/length"]) == 10  # the episode that was cut is not counted
+    assert np.nanmax(metrics["train/length"]) == 10  # the interrupted episode is not counted
     assert not multiprocessing.active_children()
 
 
-def test_workers_that_are_lost_too_often_end_the_run_with_a_checkpoint(
+def test_too_many_lost_workers_end_the_run_with_a_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("TIMES", "2")
     run = tmp_path / "run"
     assert train(run, "dies", "--no-synchronous", "--worker-restarts", "1") == 4
-    said = flat(capfd.readouterr().err)
-    assert "an environment's process died, after 1 restart: the run is saved at step 48" in said
+    printed = flat(capfd.readouterr().err)
+    assert "an environment's process died, after 1 restart: the run is saved at step 48" in printed
     assert Checkpoint.find(Run.open(run).checkpoints).step == 48
     assert cli.main(["resume", str(run)]) == 0
     assert Checkpoint.find(Run.open(run).checkpoints).step == 100
 
 
-def test_workers_that_die_before_the_first_step_leave_nothing(
+def test_a_run_whose_workers_die_before_the_first_step_leaves_no_files(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    assert train(run, "stillborn", "--no-synchronous", "--worker-restarts", "0") == 4
-    said = flat(capfd.readouterr().err)
-    assert "after 0 restarts: the run ends before its first step" in said
-    assert "Traceback" not in said
+    assert train(run, "dies_at_reset", "--no-synchronous", "--worker-restarts", "0") == 4
+    printed = flat(capfd.readouterr().err)
+    assert "after 0 restarts: the run ends before its first step" in printed
+    assert "Traceback" not in printed
     assert not run.exists()
 
 
-def test_workers_end_with_the_run_that_is_killed(tmp_path: Path) -> None:
+def test_workers_end_when_the_run_is_killed(tmp_path: Path) -> None:
     flags = ("--steps", "2000000", "--num-envs", "2")
     with started(tmp_path / "run", "slow", *flags) as process:
         wait_for(lambda: saved(tmp_path / "run"), process)
@@ -226,21 +228,21 @@ def test_workers_end_with_the_run_that_is_killed(tmp_path: Path) -> None:
     ],
 )
 def test_a_signal_to_all_processes_saves(tmp_path: Path, number: int) -> None:
-    """A terminal or a batch system sends it to the workers too."""
+    """A terminal or a batch system sends the signal to the workers, too."""
     run = tmp_path / "run"
     with started(run, "slow", "--steps", "2000000", "--num-envs", "2") as process:
         wait_for(lambda: saved(run), process)
         os.killpg(process.pid, number)
         out, _ = process.communicate()
     assert process.returncode == 128 + number
-    assert "and saved: go on with" in flat(out)
+    assert "and saved: resume with" in flat(out)
     assert cli.main(["resume", str(run), "--minutes", "0.02"]) == 0
 
 
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
 )
-def test_a_signal_while_workers_start_ends_it_at_once(tmp_path: Path, number: int) -> None:
+def test_a_signal_while_workers_start_ends_the_run_immediately(tmp_path: Path, number: int) -> None:
     run = tmp_path / "run"
     with started(run, "never_ready", "--steps", "100", "--num-envs", "2") as process:
         wait_for((tmp_path / "waits").exists, process)
@@ -252,34 +254,36 @@ def test_a_signal_while_workers_start_ends_it_at_once(tmp_path: Path, number: in
     assert not run.exists()
 
 
-def test_other_processes_of_the_caller_are_left_alone(tmp_path: Path) -> None:
+def test_other_child_processes_of_the_caller_are_not_killed(tmp_path: Path) -> None:
     bystander = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
     bystander.start()
-    assert train(tmp_path / "run", "stillborn", "--no-synchronous", "--worker-restarts", "1") == 4
+    assert (
+        train(tmp_path / "run", "dies_at_reset", "--no-synchronous", "--worker-restarts", "1") == 4
+    )
     assert multiprocessing.active_children() == [bystander]
     bystander.kill()
     bystander.join()
 
 
 @pytest.mark.parametrize("flags", [(), ("--no-synchronous",)])
-@pytest.mark.parametrize("which", ["plain", "of_its_own"])
-def test_who_cannot_be_resumed_exactly_is_told(
+@pytest.mark.parametrize("which", ["plain", "own_generator"])
+def test_an_inexact_resume_is_reported(
     tmp_path: Path, which: str, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train(tmp_path / "run", which, *flags) == 0
-    told = "a resumed run will meet other episodes" in flat(capsys.readouterr().out)
-    assert told == (which == "of_its_own")
+    reported = "a resumed run will meet other episodes" in flat(capsys.readouterr().out)
+    assert reported == (which == "own_generator")
 
 
-def test_of_several_environments_the_one_is_named_whose_reward_is_no_number(
+def test_a_nan_reward_names_the_environment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert train(tmp_path / "run", "broken", "--num-envs", "2") == 3
+    assert train(tmp_path / "run", "nan_reward", "--num-envs", "2") == 3
     error = capsys.readouterr().err
     assert "the environment's reward is nan at step 50 of environment 1" in error
 
 
-def test_a_signal_is_heeded_between_the_updates_of_a_step(
+def test_a_signal_stops_between_the_updates_of_a_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learn, made = DDPG.learn, 0
@@ -306,33 +310,33 @@ def test_a_signal_is_heeded_between_the_updates_of_a_step(
     assert (state["step"], state["updates"]) == (22, 100)
 
 
-def test_what_several_environments_keep_is_told_as_it_is(three: tuple[Path, str]) -> None:
-    run, shown = three
-    taken = sum(file.stat().st_size for file in (run / "replay").rglob("*.bin"))
-    assert f"the replay takes {decimal(taken)} for" in shown
+def test_the_replay_size_of_several_environments_is_reported(three: tuple[Path, str]) -> None:
+    run, output = three
+    size = sum(file.stat().st_size for file in (run / "replay").rglob("*.bin"))
+    assert f"the replay takes {decimal(size)} for" in output
 
 
-def test_an_error_in_another_process_is_one_line(
+def test_an_error_in_a_worker_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train(tmp_path / "run", "fails", "--num-envs", "2") == 4
     error = capsys.readouterr().err.strip()
     assert "step raised LocalError: the gripper is gone (worker_envs.py, line" in error
     assert len(error.splitlines()) == 1
-    assert not (tmp_path / "run").exists()  # it had not begun
+    assert not (tmp_path / "run").exists()  # the run had not started
 
 
-def test_environments_step_while_the_learner_learns(
+def test_environments_step_during_an_update(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each step of the environment waits for an update that begins during it."""
+    """Each step of the environment waits for an update that starts during the step."""
     learn = DDPG.learn
 
-    def told(self: DDPG, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
+    def recording(self: DDPG, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
         (tmp_path / f"learns-{self.step + 1}").touch()
         return learn(self, batch, draws)
 
-    monkeypatch.setattr(DDPG, "learn", told)
+    monkeypatch.setattr(DDPG, "learn", recording)
     flags = ["--no-synchronous", "--updates-per-step", "1", "--worker-timeout", "600"]
-    assert train(tmp_path / "run", "beside", *flags) == 0
+    assert train(tmp_path / "run", "waits_for_update", *flags) == 0
     assert read_metrics(tmp_path / "run")["step"][-1] == 100

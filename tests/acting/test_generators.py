@@ -20,7 +20,7 @@ from merl.acting.generators import (
 from merl.acting.run_env import environment_state, set_environment_state
 from toy import DotEnv
 
-MODULES_OWN = np.random.default_rng(1)
+MODULE_GENERATOR = np.random.default_rng(1)
 
 
 class Drawing(DotEnv):
@@ -36,7 +36,7 @@ class Drawing(DotEnv):
         return super().reset(**options)
 
     def draw(self) -> list[float]:
-        """A number of every generator that the environment knows."""
+        """Draw a number from each generator that the environment can use."""
         return [
             *drawn(),
             float(self.np_random.normal()),
@@ -44,7 +44,7 @@ class Drawing(DotEnv):
             self.python.random(),
             float(torch.rand((), generator=self.torch)),
             float(self.shared.normal()),
-            float(MODULES_OWN.normal()),
+            float(MODULE_GENERATOR.normal()),
             float(self.action_space.sample()[0]),
             float(self.observation_space.sample()["joint"][0]),
         ]
@@ -58,17 +58,17 @@ def drawn() -> list[float]:
     ]
 
 
-def test_a_seed_decides_the_global_generators() -> None:
+def test_a_seed_determines_the_global_generators() -> None:
     several = []
-    for seed in (0, 1, 0, 2**32):  # NumPy's takes no more than 32 bits
+    for seed in (0, 1, 0, 2**32):  # NumPy's seed has at most 32 bits
         seed_global_generators(seed)
         several.append(drawn())
     assert several[0] == several[2]
     assert not set(several[0]) & set(several[1])
 
 
-def test_the_global_generators_come_back_from_json() -> None:
-    np.random.normal()  # noqa: NPY002 (it keeps the second of two numbers)
+def test_global_generators_are_restored_from_json() -> None:
+    np.random.normal()  # noqa: NPY002 (NumPy stores the second of two numbers)
     state = json.loads(json.dumps(global_state()))
     first = drawn()
     drawn()
@@ -77,7 +77,7 @@ def test_the_global_generators_come_back_from_json() -> None:
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_what_an_environment_draws_is_not_moved(wrapped: bool) -> None:
+def test_kept_generators_restores_all_generators(wrapped: bool) -> None:
     env = Drawing()
     whole: Any = gymnasium.wrappers.TimeLimit(env, 5) if wrapped else env
     env.reset(seed=7)
@@ -93,10 +93,10 @@ def test_what_an_environment_draws_is_not_moved(wrapped: bool) -> None:
     assert expected != before
 
 
-def test_an_error_puts_them_back_too() -> None:
+def test_kept_generators_restores_after_an_error() -> None:
     env = Drawing()
     env.reset(seed=7)
-    env.draw()  # of the spaces' generators, too, which are made by that
+    env.draw()  # this also makes the generators of the spaces
     with kept_generators(env):
         expected = env.draw()
     with pytest.raises(ZeroDivisionError), kept_generators(env):
@@ -105,7 +105,7 @@ def test_an_error_puts_them_back_too() -> None:
 
 
 def test_an_environment_state_of_an_earlier_checkpoint_is_restored() -> None:
-    """It had no global generators, or nothing at all."""
+    """An earlier state has no global generators, or is None."""
     env = DotEnv()
     env.reset(seed=3)
     state = environment_state(env)

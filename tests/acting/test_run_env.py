@@ -1,4 +1,4 @@
-"""A run's environment gives what its agent consumes and nothing else."""
+"""The environment of a run has only the observation keys that its agent uses."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_resume_refuses_other_samples() -> None:
     env = EnvConfig(renderer="raster", image_size=24, samples=3)
     recorded = TrainConfig("reach_duplo", env=env)
     other = dataclasses.replace(recorded, env=dataclasses.replace(env, samples=2))
-    with pytest.raises(MerlError, match=r"cannot go on with env.samples 3 -> 2"):
+    with pytest.raises(MerlError, match=r"cannot resume with env.samples 3 -> 2"):
         merge_resume_config(recorded, other)
 
 
@@ -65,7 +65,7 @@ def test_samples_reach_the_environment_of_a_run() -> None:
         ("sac", {"state"}),
     ],
 )
-def test_it_gives_what_its_agent_senses(agent: str, keys: set[str]) -> None:
+def test_observation_has_the_keys_of_the_agent(agent: str, keys: set[str]) -> None:
     config = TrainConfig("reach_duplo", agent_name=agent, agent=AGENTS[agent], env=SMALL)
     env = make_run_env(config)
     space, _ = run_spaces(config, env)
@@ -73,48 +73,48 @@ def test_it_gives_what_its_agent_senses(agent: str, keys: set[str]) -> None:
     assert set(env.reset(seed=0)[0]) == keys
     assert env.unwrapped.config.observations == tuple(  # type: ignore[attr-defined]
         name for name in ("image", "proprio", "state") if name in keys
-    )  # nothing else was computed and thrown away
+    )  # no other observation was computed
     env.close()
 
 
-def test_what_the_critic_is_told_is_there_too() -> None:
+def test_observation_includes_privileged_keys() -> None:
     agent = dataclasses.replace(AGENTS["merl"], privileged=("state",))
     env = make_run_env(TrainConfig("reach_duplo", agent=agent, env=SMALL))
     assert set(env.reset(seed=0)[0]) == {"image", "proprio", "state"}
     env.close()
 
 
-def test_the_dot_is_narrowed_as_well() -> None:
+def test_observation_of_a_user_environment_has_the_keys_of_the_agent() -> None:
     config = TrainConfig("merl.envs.dot:whole", agent_name="drqv2", agent=AGENTS["drqv2"])
     env = make_run_env(config)
     assert set(env.observation_space) == set(env.reset(seed=0)[0]) == {"image"}  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (
             {"vectors": ("proprio",), "privileged": ("proprio",)},
-            "which the actor has already",
+            "which the actor uses too",
         ),
-        ({"images": (), "privileged": ("proprio",)}, "leaves the actor nothing"),
+        ({"images": (), "privileged": ("proprio",)}, "leaves no vector for the actor"),
         ({"privileged": ("touch",)}, "agent.privileged names 'touch'"),
         ({"privileged": ("state",), "fusion": "shared"}, "use --agent.fusion decoupled"),
         (
             {"images": ("wrist",)},
             r"agent.images names 'wrist', but the environment gives \['image'",
         ),
-        ({"images": (), "vectors": ()}, "finds nothing to sense"),
+        ({"images": (), "vectors": ()}, "can use no observation"),
     ],
 )
-def test_what_does_not_fit_is_named(change: dict, says: str) -> None:  # type: ignore[type-arg]
+def test_invalid_keys_are_refused_by_name(change: dict, message: str) -> None:  # type: ignore[type-arg]
     agent = dataclasses.replace(AGENTS["merl"], **change)
-    with pytest.raises(MerlError, match=says):
+    with pytest.raises(MerlError, match=message):
         make_run_env(TrainConfig("reach_duplo", agent=agent, env=SMALL))
 
 
-class Greedy(DotEnv):
-    """Installs a handler of its own for Ctrl-C in every method."""
+class ReplacesHandlers(DotEnv):
+    """Installs its own handler for Ctrl-C in every method."""
 
     def __init__(self) -> None:
         signal.signal(signal.SIGINT, lambda *_: None)
@@ -136,13 +136,13 @@ class Greedy(DotEnv):
         raise KeyboardInterrupt
 
 
-def greedy() -> DotEnv:
-    return Greedy()
+def replaces_handlers() -> DotEnv:
+    return ReplacesHandlers()
 
 
-def test_signal_handlers_are_put_back_after_every_call(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signal_handlers_are_restored_after_every_call(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    config = TrainConfig("test_run_env:greedy", agent=AGENTS["merl"])
+    config = TrainConfig("test_run_env:replaces_handlers", agent=AGENTS["merl"])
     env: Any = None
 
     def make() -> None:
@@ -167,7 +167,7 @@ def test_signal_handlers_are_put_back_after_every_call(monkeypatch: pytest.Monke
         signal.signal(signal.SIGINT, mine)
 
 
-def test_evaluations_start_where_they_are_asked_to() -> None:
+def test_evaluations_use_eval_start() -> None:
     trained = TrainConfig(
         "move_box",
         agent_name="merl_state",
@@ -190,14 +190,14 @@ def test_evaluations_start_where_they_are_asked_to() -> None:
     assert heights["trained"] < 0.15 < heights["evaluated"]
 
 
-def test_starts_of_evaluations_are_refused_where_there_are_none() -> None:
-    with pytest.raises(MerlError, match=r"eval\.start .* my_env:make decides where it starts"):
+def test_eval_start_is_refused_for_user_environments_and_empty_values() -> None:
+    with pytest.raises(MerlError, match=r"eval\.start .* my_env:make sets its own start states"):
         TrainConfig("my_env:make", eval=EvaluationConfig(start=("above",)))
     with pytest.raises(MerlError, match="start"):
         TrainConfig("move_box", eval=EvaluationConfig(start=()))
 
 
-def test_a_run_evaluates_in_the_environment_that_its_evaluations_start_in(tmp_path: Path) -> None:
+def test_the_evaluation_environment_of_a_run_uses_eval_start(tmp_path: Path) -> None:
     config = TrainConfig(
         "move_box",
         agent_name="merl_state",

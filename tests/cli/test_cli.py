@@ -383,7 +383,7 @@ BAD = {
     "train reach_duplo --renderer wrap": "'gl', 'raster'",
     "train reach_duplo --renderer raster --samples 5": "samples is 5: give a whole number",
     "train reach_duplo --renderer gl --samples 2": "use renderer raster, or samples 1",
-    "train reach_duplo --start around": "is solved where the hand starts around",
+    "train reach_duplo --start around": "reach_duplo has no start 'around', only 'above'",
     "train move_box --preset smoke --start around --occluded": "occluded needs --start above",
     "train reach_duplo --reward staged": "only 'paper'",
     "train move_box --preset smoke --reward near": "'paper', 'staged'",
@@ -483,7 +483,7 @@ def test_an_existing_folder_is_left_alone(
 ) -> None:
     (tmp_path / "mine").write_text("precious")
     assert main(["train", "reach_duplo", "--preset", "smoke", "--run-dir", str(tmp_path)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
@@ -594,10 +594,10 @@ def test_ctrl_c_before_training_says_that_nothing_was_written(
         (lambda record: record["config"]["agent"].update(tau=5), "tau must lie in (0, 1]"),
         (lambda record: record["config"]["agent"].update(conv_strides=[2, "1"]), "strides is '1'"),
         (lambda record: record["config"].update(seed=True), "seed is True"),
-        (lambda record: record["config"]["env"].update(goal="near"), "goal is not known to this"),
+        (lambda record: record["config"]["env"].update(goal="near"), "goal is unknown to this"),
         (
             lambda record: record["config"]["env"].update(renderer="warp"),
-            "renderer 'warp' no longer exists: train anew with renderer raster, or use the version",
+            "renderer 'warp' no longer exists: train again with renderer raster, or use the",
         ),
         (lambda record: record["config"]["env"].update(reward="near"), "reward 'near' no longer"),
         (lambda record: record.pop("machine"), "it has no 'machine'"),

@@ -20,42 +20,42 @@ from merl.runs.run import Run
 
 NAN, INF = float("nan"), float("inf")
 BAD_STEP = 70
-"""Where `Broken` returns what is no number."""
+"""The step at which `Broken` starts to return NaN or infinity."""
 
 
 class Broken(gymnasium.Env[Any, Any]):
-    """Ten steps an episode; from `BAD_STEP` on what it gives is no number."""
+    """Ten steps per episode; from `BAD_STEP` on, reward or observation is not finite."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
-    def __init__(self, reward: float = 0.0, place: float = 0.0) -> None:
-        self.bad_reward, self.bad_place = reward, place
+    def __init__(self, reward: float = 0.0, offset: float = 0.0) -> None:
+        self.bad_reward, self.bad_offset = reward, offset
         self.taken = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
-        if seed is not None:  # a run's first, after it has timed its environment
+        if seed is not None:  # the first reset of a run, after the environment was timed
             self.taken = 0
         return self.np_random.normal(size=3).astype(np.float32), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.taken += 1
-        seen = self.np_random.normal(size=3).astype(np.float32)
+        observation = self.np_random.normal(size=3).astype(np.float32)
         bad = self.taken >= BAD_STEP
-        seen[1] += self.bad_place if bad else 0.0
-        return seen, self.bad_reward if bad else 1.0, False, self.taken % 10 == 0, {}
+        observation[1] += self.bad_offset if bad else 0.0
+        return observation, self.bad_reward if bad else 1.0, False, self.taken % 10 == 0, {}
 
 
 def nan_reward() -> Broken:
     return Broken(reward=NAN)
 
 
-def infinite_place() -> Broken:
-    return Broken(place=INF)
+def infinite_observation() -> Broken:
+    return Broken(offset=INF)
 
 
-def sound() -> Broken:
+def finite() -> Broken:
     return Broken(reward=1.0)
 
 
@@ -68,39 +68,39 @@ def train(tmp_path: Path, function: str, *flags: str) -> tuple[int, Path]:
 
 
 @pytest.fixture(autouse=True)
-def _findable(monkeypatch: pytest.MonkeyPatch) -> None:
+def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
 
 
 @pytest.mark.parametrize(
-    ("function", "says"),
+    ("function", "message"),
     [
         ("nan_reward", f"reward is nan at step {BAD_STEP}"),
-        ("infinite_place", f"observation 'state' is inf in place 1 at step {BAD_STEP}"),
+        ("infinite_observation", f"observation 'state' is inf at index 1 at step {BAD_STEP}"),
     ],
 )
-def test_what_the_environment_gives_stops_the_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], function: str, says: str
+def test_a_non_finite_reward_or_observation_stops_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], function: str, message: str
 ) -> None:
     code, run = train(tmp_path, function)
-    told = capsys.readouterr()
+    err = capsys.readouterr().err
     assert code == 3
-    assert says in told.err
-    assert "Traceback" not in told.err
+    assert message in err
+    assert "Traceback" not in err
     start = Checkpoint.find(Run.open(run).checkpoints)
     assert start.step == BAD_STEP - 1
-    assert f"the run is saved at step {BAD_STEP - 1}: mend it" in told.err
+    assert f"the run is saved at step {BAD_STEP - 1}: mend it" in err
     for name in ("reward", "observation.state"):
         assert np.isfinite(np.fromfile(run / "replay" / f"{name}.bin", "<f4")).all()
 
 
-def test_a_loss_stops_the_run_and_the_last_checkpoint_is_good(
+def test_a_non_finite_loss_stops_the_run_and_keeps_the_last_checkpoint(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, run = train(tmp_path, "sound", "--agent.learning-rate", "1e30")
-    told = capsys.readouterr()
+    code, run = train(tmp_path, "finite", "--agent.learning-rate", "1e30")
+    err = capsys.readouterr().err
     assert code == 3
-    assert "is not finite at step" in told.err or "no longer finite" in told.err
+    assert "is not finite at step" in err or "no longer finite" in err
     start = Checkpoint.find(Run.open(run).checkpoints)
     weights = load_file(start.path / "weights.safetensors")
     assert all(tensor.isfinite().all() for tensor in weights.values())
@@ -108,7 +108,7 @@ def test_a_loss_stops_the_run_and_the_last_checkpoint_is_good(
         assert not np.isinf(values).any(), name
 
 
-def test_a_moment() -> None:
+def test_check_finite_names_the_value_and_the_step() -> None:
     good = {"image": np.zeros((4, 4, 3), np.uint8), "joints": np.zeros(3, np.float32)}
     check_finite(good, 1.0, 1)
     with pytest.raises(NotFinite, match="reward is inf at step 1,234"):
@@ -120,11 +120,11 @@ def test_a_moment() -> None:
         with pytest.raises(NotFinite, match=r"reward is 1e\+39, which is beyond float32, at"):
             check_finite(good, 1e39, 1)
     joints = np.array([0.0, 1.0, NAN], np.float32)
-    with pytest.raises(NotFinite, match="'joints' is nan in place 2 at step 5"):
+    with pytest.raises(NotFinite, match="'joints' is nan at index 2 at step 5"):
         check_finite({**good, "joints": joints}, 1.0, 5)
 
 
-def test_weights() -> None:
+def test_check_weights_names_the_tensor() -> None:
     good = {"layer.weight": torch.ones(2, 2), "count": torch.tensor(3)}
     check_weights({"networks": good})
     bad = {**good, "layer.bias": torch.tensor([0.0, INF])}
@@ -132,7 +132,7 @@ def test_weights() -> None:
         check_weights({"networks": bad})
 
 
-def test_the_first_bad_step_is_told_however_late_one_looks() -> None:
+def test_the_first_bad_step_is_reported_also_by_later_checks() -> None:
     guard = LossGuard()
     guard.check()
     guard.watch({}, 1)
@@ -143,7 +143,7 @@ def test_the_first_bad_step_is_told_however_late_one_looks() -> None:
         guard.watch({"critic_loss": torch.tensor(INF), "actor_loss": torch.tensor(1.0)}, 4)
 
 
-def test_updates_may_differ_in_what_they_report() -> None:
+def test_updates_may_report_different_metrics() -> None:
     guard = LossGuard()
     guard.watch({"critic_loss": torch.tensor(1.0)}, 1)
     guard.watch({"critic_loss": torch.tensor(1.0), "actor_loss": torch.tensor(2.0)}, 2)

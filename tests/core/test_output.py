@@ -1,4 +1,4 @@
-"""Output is an observer: whatever becomes of what is printed, the run continues and is saved."""
+"""Failed writes to the output never end a run: it continues and is saved."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ LINE += "--seed-steps 390 --replay.batch-size 8 --agent.hidden-dim 8 --eval.epis
 LINE += "--eval.every 200 --eval.video none --eval.no-references --run-dir run"
 
 
-def without_reader() -> TextIO:
+def pipe_without_reader() -> TextIO:
     reader, writer = os.pipe()
     os.close(reader)
     return os.fdopen(writer, "w")
 
 
-def full() -> TextIO:
+def full_disk() -> TextIO:
     return open("/dev/full", "w")  # noqa: PTH123
 
 
@@ -41,7 +41,7 @@ def closed() -> TextIO:
 
 
 class Terminal(io.StringIO):
-    """A terminal that is closed after a few writes; the live view draws in a thread of its own."""
+    """A terminal that is closed after a few writes, while the live view draws in another thread."""
 
     writes = 0
 
@@ -55,12 +55,12 @@ class Terminal(io.StringIO):
         return super().write(text)
 
 
-BROKEN = [without_reader, full, closed, Terminal, lambda: None]
+BROKEN = [pipe_without_reader, full_disk, closed, Terminal, lambda: None]
 
 
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
 @pytest.mark.parametrize("broken", BROKEN)
-def test_a_run_goes_on_to_its_end(
+def test_a_run_completes_with_a_broken_stream(
     broken: Callable[[], TextIO | None], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -74,7 +74,7 @@ def test_a_run_goes_on_to_its_end(
 
 
 def _warns(*_: object) -> None:
-    """As libraries do at any time."""
+    """Print and warn, as libraries do at any time."""
     warnings.warn("something", stacklevel=1)
     logging.getLogger("merl").warning("something")
     print("something", file=sys.stderr)
@@ -82,10 +82,10 @@ def _warns(*_: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("broken", "code"), [(without_reader, 141), (full, 2), (closed, 2), (lambda: None, 0)]
+    ("broken", "code"), [(pipe_without_reader, 141), (full_disk, 2), (closed, 2), (lambda: None, 0)]
 )
 @pytest.mark.parametrize("command", [["--version"], ["train", "--help"], ["bench", "--help"]])
-def test_a_command_that_only_prints_tells_by_its_code(
+def test_a_command_that_only_prints_reports_a_failed_write_by_its_exit_code(
     broken: Callable[[], TextIO | None],
     code: int,
     command: list[str],
@@ -95,7 +95,7 @@ def test_a_command_that_only_prints_tells_by_its_code(
     monkeypatch.setattr(sys, "stdout", broken())
     try:
         ended = main(command)
-    except SystemExit as stop:  # as after help
+    except SystemExit as stop:  # after --help
         ended = int(stop.code or 0)
     assert ended == code
     error = capsys.readouterr().err
@@ -103,14 +103,16 @@ def test_a_command_that_only_prints_tells_by_its_code(
     assert "Traceback" not in error
 
 
-def test_bad_input_keeps_its_code_where_it_cannot_be_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_input_has_its_exit_code_with_broken_streams(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for broken in BROKEN:
         monkeypatch.setattr(sys, "stdout", broken())
         monkeypatch.setattr(sys, "stderr", broken())
         assert main(["resume", "nowhere"]) == 2
 
 
-def test_what_the_encoding_lacks_is_escaped() -> None:
+def test_characters_outside_the_encoding_are_escaped() -> None:
     raw = io.BytesIO()
     stream = TolerantStream(io.TextIOWrapper(raw, encoding="ascii"))
     print("größer \udcff", file=stream, flush=True)  # type: ignore[arg-type]
@@ -127,8 +129,8 @@ def test_what_the_encoding_lacks_is_escaped() -> None:
         ("--nothing 2> /dev/full", 2),
     ],
 )
-def test_a_shell_sees_the_code_and_nothing_else(tmp_path: Path, line: str, code: int) -> None:
-    """To the end of the process: Python flushes once more when it exits."""
+def test_a_shell_gets_only_the_exit_code(tmp_path: Path, line: str, code: int) -> None:
+    """Run until the process has ended: Python flushes once more at exit."""
     head = "exec 2>&1; set -o pipefail; "
     command = f"{head}{sys.executable} -m merl.cli {line}"
     done = subprocess.run(
@@ -137,7 +139,7 @@ def test_a_shell_sees_the_code_and_nothing_else(tmp_path: Path, line: str, code:
     assert done.returncode == code, done.stdout
     assert "Exception ignored" not in done.stdout
     assert "Traceback" not in done.stdout
-    if line.startswith("train"):  # no file has taken the place of a closed descriptor
+    if line.startswith("train"):  # no file was opened on a closed standard descriptor
         assert (tmp_path / "run" / "lock").read_text().isdigit()
         assert (tmp_path / "run" / "checkpoints" / "00000400").is_dir()
         assert (tmp_path / "run" / "metrics.csv").read_text().startswith("step,")

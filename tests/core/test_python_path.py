@@ -1,4 +1,4 @@
-"""Processes that are started do not import from the working folder."""
+"""Child processes do not import modules from the working folder."""
 
 import os
 import subprocess
@@ -15,7 +15,7 @@ from merl.envs.user_env import load_module
 VARIABLE = "PYTHONSAFEPATH"
 
 
-def test_a_process_does_not_import_from_the_working_folder(tmp_path: Path) -> None:
+def test_a_child_process_does_not_import_from_the_working_folder(tmp_path: Path) -> None:
     (tmp_path / "ctypes.py").write_text("open('imported', 'w')")
     for hidden in (True, False):
         if hidden:
@@ -35,7 +35,7 @@ def test_commands_run_with_the_working_folder_hidden(monkeypatch: pytest.MonkeyP
     assert VARIABLE not in os.environ
 
 
-def test_a_users_environment_may_start_processes_as_before(
+def test_a_users_environment_has_the_users_search_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
@@ -48,8 +48,8 @@ def test_a_users_environment_may_start_processes_as_before(
 def test_matplotlib_does_not_read_the_working_folders_settings(tmp_path: Path) -> None:
     (tmp_path / "matplotlibrc").write_text("figure.dpi: 7")
     code = "import merl.report.drawing, matplotlib; print(matplotlib.rcParams['figure.dpi'])"
-    said = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True
     )
-    assert float(said.stdout) != 7
-    load_matplotlib()  # without effect once it is imported
+    assert float(done.stdout) != 7
+    load_matplotlib()  # no effect after Matplotlib is imported

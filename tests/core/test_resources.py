@@ -1,4 +1,4 @@
-"""What a process may use, read from pretended system files."""
+"""Available memory and disk space, with simulated system files."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def group(folder: Path, **files: str) -> None:
         (folder / name.replace("__", ".")).write_text(text)
 
 
-def test_without_control_groups_it_is_what_the_machine_has(tmp_path):
+def test_memory_without_control_groups_is_that_of_the_machine(tmp_path):
     assert available_memory(machine(tmp_path, 8 * GIB)) == 8 * GIB
 
 
-def test_version_2_counts_file_cache_as_free(tmp_path):
+def test_cgroup_version_2_counts_file_cache_as_free(tmp_path):
     root = machine(tmp_path, 64 * GIB, "0::/jobs/mine\n")
     mine = root / "sys/fs/cgroup/jobs/mine"
     cache = f"anon 5\ninactive_file {GIB}\nactive_file {GIB}\n"
@@ -42,7 +42,7 @@ def test_version_2_counts_file_cache_as_free(tmp_path):
     assert available_memory(root) == 3 * GIB
 
 
-def test_the_tightest_of_all_parents_counts(tmp_path):
+def test_the_smallest_limit_of_all_parent_groups_counts(tmp_path):
     root = machine(tmp_path, 64 * GIB, "0::/jobs/mine\n")
     parent = root / "sys/fs/cgroup/jobs"
     group(parent / "mine", memory__max="max\n", memory__current="1\n", memory__stat="")
@@ -50,9 +50,9 @@ def test_the_tightest_of_all_parents_counts(tmp_path):
     assert available_memory(root) == GIB
 
 
-def test_version_1(tmp_path):
+def test_cgroup_version_1(tmp_path):
     root = machine(tmp_path, 64 * GIB, "9:cpu,cpuacct:/x\n4:memory:/docker/abc\n0::/\n")
-    # Inside the container the group's own name is not there, only the container's root.
+    # In a container the group has another name; only the root of the container exists.
     group(
         root / "sys/fs/cgroup/memory",
         memory__limit_in_bytes=f"{4 * GIB}\n",
@@ -62,13 +62,13 @@ def test_version_1(tmp_path):
     assert available_memory(root) == 2 * GIB
 
 
-def test_a_group_that_is_full_leaves_nothing(tmp_path):
+def test_a_full_control_group_leaves_no_memory(tmp_path):
     root = machine(tmp_path, 64 * GIB, "0::/\n")
     group(root / "sys/fs/cgroup", memory__max="5", memory__current="9", memory__stat="")
     assert available_memory(root) == 0
 
 
-def test_a_machine_that_tells_nothing_is_taken_at_its_physical_memory(tmp_path):
+def test_without_system_files_memory_is_the_physical_memory(tmp_path):
     assert available_memory(tmp_path) > 100_000_000
 
 
@@ -80,7 +80,7 @@ def test_free_disk_of_a_folder_that_does_not_exist_yet(tmp_path):
 
 
 @pytest.mark.parametrize("code", [None, errno.EOPNOTSUPP, errno.EINVAL])
-def test_reserving_keeps_what_is_there_and_adds_zeros(tmp_path, monkeypatch, code):
+def test_reserving_keeps_the_content_and_appends_zeros(tmp_path, monkeypatch, code):
     if code is not None:
 
         def refuse(*_: int) -> None:
@@ -96,13 +96,13 @@ def test_reserving_keeps_what_is_there_and_adds_zeros(tmp_path, monkeypatch, cod
     assert file.stat().st_size == 3_000_000
 
 
-def test_reserving_where_the_system_has_no_such_call(tmp_path, monkeypatch):
+def test_reserving_without_posix_fallocate(tmp_path, monkeypatch):
     monkeypatch.delattr(os, "posix_fallocate")
     reserve_file(tmp_path / "file", 1000)
     assert (tmp_path / "file").read_bytes() == bytes(1000)
 
 
-def test_a_full_disk_gives_the_file_its_old_length(tmp_path, monkeypatch):
+def test_a_full_disk_restores_the_length_of_the_file(tmp_path, monkeypatch):
     def refuse(*_: int) -> None:
         raise OSError(errno.EOPNOTSUPP, "not supported")
 
@@ -121,7 +121,7 @@ def test_a_full_disk_gives_the_file_its_old_length(tmp_path, monkeypatch):
     assert file.read_bytes() == b"abc"
 
 
-def test_freed_memory_is_kept_for_the_next_of_its_size() -> None:
+def test_keep_freed_memory_avoids_page_faults() -> None:
     program = """
 import resource, sys
 from merl.core.resources import keep_freed_memory
@@ -133,9 +133,9 @@ for _ in range(3):
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
     faults = {}
-    for how in ("keep", "default"):
-        command = [sys.executable, "-c", program, how]
+    for mode in ("keep", "default"):
+        command = [sys.executable, "-c", program, mode]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
-        faults[how] = int(done.stdout)
+        faults[mode] = int(done.stdout)
     assert faults["keep"] < 100
     assert faults["default"] > 1000

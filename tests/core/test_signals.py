@@ -14,7 +14,7 @@ from merl.core.signals import Interrupt, handlers_kept
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
-def test_a_signal_is_a_wish_and_the_former_handler_comes_back(number: int) -> None:
+def test_a_signal_is_recorded_and_the_former_handler_is_restored(number: int) -> None:
     former = signal.getsignal(number)
     with Interrupt().listening() as interrupt:
         assert interrupt.number is None
@@ -23,7 +23,7 @@ def test_a_signal_is_a_wish_and_the_former_handler_comes_back(number: int) -> No
     assert signal.getsignal(number) == former
 
 
-def test_a_second_hangup_lets_it_save() -> None:
+def test_a_second_sighup_does_not_end_the_process() -> None:
     with Interrupt().listening() as interrupt:
         os.kill(os.getpid(), signal.SIGHUP)
         time.sleep(0.2)
@@ -31,15 +31,15 @@ def test_a_second_hangup_lets_it_save() -> None:
         assert interrupt.number == signal.SIGHUP
 
 
-def test_the_same_signal_to_process_and_group_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("merl.core.signals._APART", 600.0)  # as far apart as on a busy machine
+def test_one_signal_to_process_and_group_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("merl.core.signals._MIN_INTERVAL", 600.0)  # a busy machine is slow
     with Interrupt().listening() as interrupt:
         for _ in range(2):
             os.kill(os.getpid(), signal.SIGTERM)
         assert interrupt.number == signal.SIGTERM
 
 
-def test_what_is_ignored_stays_ignored() -> None:
+def test_an_ignored_signal_stays_ignored() -> None:
     former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with Interrupt().listening() as interrupt:
@@ -50,7 +50,7 @@ def test_what_is_ignored_stays_ignored() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
-def test_a_second_signal_ends_at_once(number: int) -> None:
+def test_a_second_signal_ends_the_process_immediately(number: int) -> None:
     program = (
         "import os, time; from merl.core.signals import Interrupt\n"
         "with Interrupt().listening():\n"
@@ -62,24 +62,24 @@ def test_a_second_signal_ends_at_once(number: int) -> None:
     assert done.stdout == b""
 
 
-def test_who_has_to_wait_is_told_for_what() -> None:
+def test_a_reminder_is_printed_after_some_seconds() -> None:
     program = (
         "import os, signal; from merl.core import signals\n"
         "signals.PATIENCE = %s\n"
         "with signals.Interrupt().listening() as interrupt:\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
-        "    timer = interrupt._telling\n"
+        "    timer = interrupt._reminder\n"
         "    if signals.PATIENCE < 1: timer.join()\n"
         "timer.join()"
     )
-    for patience, told in ((0.1, 1), (600.0, 0)):
+    for patience, count in ((0.1, 1), (600.0, 0)):
         done = subprocess.run(
             [sys.executable, "-c", program % patience], capture_output=True, check=True, text=True
         )
-        assert done.stderr.count("a second signal (Ctrl-C) stops at once") == told
+        assert done.stderr.count("a second signal (Ctrl-C) stops at once") == count
 
 
-def test_where_no_thread_is_to_be_had_it_is_a_wish_all_the_same(
+def test_a_signal_is_recorded_if_no_thread_can_be_started(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def refused(*_: object, **__: object) -> None:
@@ -92,41 +92,41 @@ def test_where_no_thread_is_to_be_had_it_is_a_wish_all_the_same(
         assert interrupt.number == signal.SIGTERM
 
 
-SIGINT_TAKEN_OVER = {
+HANDLER_REPLACED = {
     "by Python": lambda: signal.signal(signal.SIGINT, lambda *_: None),
     "by Python, ignored": lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     "by a C library": lambda: ctypes.CDLL(None).signal(int(signal.SIGINT), ctypes.c_void_p(1)),
 }
 
 
-@pytest.mark.parametrize("how", SIGINT_TAKEN_OVER)
-def test_a_handler_that_is_taken_over_is_put_back(how: str) -> None:
+@pytest.mark.parametrize("method", HANDLER_REPLACED)
+def test_a_replaced_handler_is_restored(method: str) -> None:
     former = signal.getsignal(signal.SIGINT)
     with Interrupt().listening() as interrupt:
         with handlers_kept():
-            SIGINT_TAKEN_OVER[how]()
+            HANDLER_REPLACED[method]()
         os.kill(os.getpid(), signal.SIGINT)
         assert interrupt.number == signal.SIGINT
     assert signal.getsignal(signal.SIGINT) == former
 
 
-def test_a_signal_that_another_handler_took_is_noted() -> None:
-    taken: list[int] = []
+def test_a_signal_that_another_handler_received_is_recorded() -> None:
+    received: list[int] = []
     with Interrupt().listening() as interrupt:
         with handlers_kept():
-            signal.signal(signal.SIGINT, lambda number, _: taken.append(number))
-            os.kill(os.getpid(), signal.SIGUSR1)  # merl's own
+            signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+            os.kill(os.getpid(), signal.SIGUSR1)  # handled by merl
             os.kill(os.getpid(), signal.SIGINT)
-        assert taken == [signal.SIGINT]
+        assert received == [signal.SIGINT]
         assert interrupt.number == signal.SIGUSR1
     with Interrupt().listening() as interrupt:
         with handlers_kept():
-            signal.signal(signal.SIGINT, lambda number, _: taken.append(number))
+            signal.signal(signal.SIGINT, lambda number, _: received.append(number))
             os.kill(os.getpid(), signal.SIGINT)
         assert interrupt.number == signal.SIGINT
 
 
-def test_handlers_are_left_alone_in_another_thread() -> None:
+def test_handlers_kept_has_no_effect_in_another_thread() -> None:
     def call() -> None:
         with handlers_kept():
             done.append(True)
@@ -138,7 +138,7 @@ def test_handlers_are_left_alone_in_another_thread() -> None:
     assert done == [True]
 
 
-def test_a_call_that_takes_the_wakeup_descriptor_and_the_handler_loses_no_later_signal() -> None:
+def test_no_signal_is_lost_after_a_call_replaced_the_wakeup_descriptor() -> None:
     with Interrupt().listening() as interrupt:
         with handlers_kept():
             signal.set_wakeup_fd(-1)

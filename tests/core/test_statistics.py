@@ -11,7 +11,7 @@ def test_bootstrap_of_two_values_by_hand():
 
 
 def test_bootstrap_of_three_values_by_hand():
-    # Resampled means 0, 1, 2, 3 with 8/27, 12/27, 6/27, 1/27: up to 2 lies 96.3 %.
+    # Resampled means: 0, 1, 2, 3 with 8/27, 12/27, 6/27, 1/27; 96.3 % of them are at most 2.
     assert bootstrap_interval([0.0, 0.0, 3.0]) == Interval(1.0, 0.0, 3.0)
     assert bootstrap_interval([0.0, 0.0, 3.0], level=0.9) == Interval(1.0, 0.0, 2.0)
 
@@ -24,19 +24,19 @@ def test_bootstrap_approaches_the_normal_interval():
     assert interval.high == pytest.approx(interval.mean + half, abs=0.2)
 
 
-def test_bootstrap_repeats_with_its_seed():
+def test_bootstrap_is_reproducible_with_a_seed():
     values = np.random.default_rng(2).normal(size=20)
     assert bootstrap_interval(values, seed=3) == bootstrap_interval(values, seed=3)
     assert bootstrap_interval(values, seed=3) != bootstrap_interval(values, seed=4)
 
 
 @pytest.mark.parametrize("values", [[0.1], [0.1] * 7])
-def test_bootstrap_without_spread_has_no_width(values):
+def test_bootstrap_of_equal_values_has_width_zero(values):
     assert bootstrap_interval(values) == Interval(0.1, 0.1, 0.1)
 
 
 @pytest.mark.parametrize("values", [[], [1.0, float("nan")], [float("inf")]])
-def test_bootstrap_refuses_what_has_no_mean(values):
+def test_bootstrap_refuses_empty_and_non_finite_samples(values):
     with pytest.raises(ValueError, match="finite"):
         bootstrap_interval(values)
 
@@ -62,7 +62,7 @@ def test_wilson_refuses_impossible_counts(successes, n):
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 95])
-def test_a_level_is_a_fraction(level):
+def test_a_level_outside_zero_to_one_is_refused(level):
     with pytest.raises(ValueError, match="level"):
         bootstrap_interval([1.0, 2.0], level=level)
     with pytest.raises(ValueError, match="level"):

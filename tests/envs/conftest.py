@@ -1,8 +1,8 @@
-"""What tests of several files draw."""
+"""Fixtures for the tests of the renderers."""
 
 import pytest
 
-import merl.tasks  # noqa: F401  (before dm_control: it keeps the import from looking for OpenGL)
+import merl.tasks  # noqa: F401  (before dm_control, which then does not look for OpenGL)
 
 # isort: split
 from dm_control import mujoco as dm_mujoco

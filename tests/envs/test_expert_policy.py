@@ -1,4 +1,4 @@
-"""The experts as policies: what they ask for reaches the joints."""
+"""Experts as policies: their velocities reach the joints."""
 
 import gymnasium
 import numpy as np
@@ -11,10 +11,10 @@ from merl.evaluation.evaluation import evaluate
 
 
 class Wrapped(gymnasium.Wrapper):
-    """Changes nothing."""
+    """A wrapper that changes nothing."""
 
 
-def test_evaluate_finds_the_task_solved():
+def test_evaluate_reports_that_the_expert_solves_the_task():
     env = Wrapped(make_env("lift_box", observations=("proprio",)))
     policy = ExpertPolicy(env)
     result = evaluate(policy, env, 2, reset=policy.reset)
@@ -41,7 +41,7 @@ def solves(task, seed, **form):
         pytest.param(600019, id="finger scrapes along the floor"),
     ],
 )
-def test_expert_solves_occluded_starts_that_need_care(seed):
+def test_expert_solves_difficult_occluded_starts(seed):
     assert solves("move_box", seed, occluded=True)
 
 
@@ -49,7 +49,7 @@ def test_expert_keeps_a_carried_box_off_the_disc():
     assert solves("lift_box", 77053, occluded=True)
 
 
-def test_an_action_asks_for_the_experts_velocities():
+def test_actions_command_the_velocities_of_the_expert():
     env = make_env("reach_duplo", observations=("proprio",))
     policy = ExpertPolicy(env)
     observation, _ = env.reset(seed=0)
@@ -61,15 +61,15 @@ def test_an_action_asks_for_the_experts_velocities():
     np.testing.assert_allclose(env.physics.data.ctrl, velocities, rtol=0, atol=1e-6)
 
 
-def test_expert_follows_an_environment_that_is_closed_and_opened_again():
+def test_expert_works_in_an_environment_that_was_closed_and_reset():
     def actions(env, policy):
         env.reset(seed=5)
         policy.reset()
-        taken = []
+        chosen = []
         for _ in range(3):
-            taken.append(policy(None))
-            env.step(taken[-1])
-        return np.array(taken)
+            chosen.append(policy(None))
+            env.step(chosen[-1])
+        return np.array(chosen)
 
     env = make_env("reach_duplo", observations=("proprio",))
     policy = ExpertPolicy(env)
@@ -79,11 +79,11 @@ def test_expert_follows_an_environment_that_is_closed_and_opened_again():
         policy(None)
     np.testing.assert_array_equal(actions(env, policy), expected)
     env.close()
-    env.reset(seed=5)  # no policy.reset(): the episode is a new one all the same
+    env.reset(seed=5)  # without policy.reset(): the expert still starts a new plan
     np.testing.assert_array_equal(policy(None), expected[0])
     env.close()
 
 
-def test_a_foreign_environment_is_met_with_one_sentence():
+def test_other_environments_are_rejected():
     with pytest.raises(MerlError, match="there is no expert for"):
         ExpertPolicy(gymnasium.make("Pendulum-v1"))

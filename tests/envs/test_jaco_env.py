@@ -1,4 +1,4 @@
-"""The environment as Gymnasium and an agent see it."""
+"""`JacoEnv` and `make_env`: spaces, episodes, seeds, settings."""
 
 import warnings
 from dataclasses import fields
@@ -17,8 +17,8 @@ ACTION = np.zeros(9, np.float32)
 
 
 @pytest.fixture(scope="module")
-def blind():
-    """An environment without pictures, which is fast."""
+def env_without_images():
+    """An environment without images, which is fast."""
     env = make_env("reach_duplo", renderer="raster", observations=("proprio", "state"))
     yield env
     env.close()
@@ -45,7 +45,7 @@ def episode(env, steps=5, action_seed=0, **reset):
         ("lift_box", {"proprio": "full", "occluded": True}),
     ],
 )
-def test_gymnasium_finds_nothing_wrong(task, config):
+def test_the_environment_passes_gymnasiums_checks(task, config):
     config = {**config, "observations": ("image", "proprio", "state")}
     env = make_env(task, renderer="raster", image_size=32, render_mode="rgb_array", **config)
     with warnings.catch_warnings():
@@ -70,26 +70,24 @@ def test_spaces():
     env.close()
 
 
-def test_a_seed_alone_decides_the_start(blind):
-    first = episode(blind, seed=7)
-    blind.reset()
-    blind.step(ACTION)
-    other = episode(blind, seed=8)
-    again = episode(blind, seed=7)
+def test_the_start_depends_only_on_the_seed(env_without_images):
+    first = episode(env_without_images, seed=7)
+    env_without_images.reset()
+    env_without_images.step(ACTION)
+    other = episode(env_without_images, seed=8)
+    again = episode(env_without_images, seed=7)
     assert all(same(a, b) for a, b in zip(first, again, strict=True))
     assert not same(first[0], other[0])
-    with_picture = make_env("reach_duplo", renderer="raster", observations=("image", "state"))
-    elsewhere = episode(with_picture, seed=7)
-    assert all(
-        np.array_equal(a["state"], b["state"]) for a, b in zip(first, elsewhere, strict=True)
-    )
-    with_picture.close()
+    with_image = make_env("reach_duplo", renderer="raster", observations=("image", "state"))
+    states = episode(with_image, seed=7)
+    assert all(np.array_equal(a["state"], b["state"]) for a, b in zip(first, states, strict=True))
+    with_image.close()
 
 
-def test_episodes_differ_and_can_be_taken_up_again(blind):
-    blind.reset(seed=1)
-    state = blind.np_random.bit_generator.state
-    second, third = episode(blind), episode(blind)
+def test_episodes_differ_and_repeat_from_a_restored_generator(env_without_images):
+    env_without_images.reset(seed=1)
+    state = env_without_images.np_random.bit_generator.state
+    second, third = episode(env_without_images), episode(env_without_images)
     assert not same(second[0], third[0])
     another = make_env("reach_duplo", renderer="raster", observations=("proprio", "state"))
     another.np_random.bit_generator.state = state
@@ -114,7 +112,7 @@ def test_an_episode_ends_by_truncation_at_250_steps(task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_seed_gives_the_same_episode_whatever_is_observed(task):
+def test_the_episode_of_a_seed_does_not_depend_on_the_observations(task):
     environments = [
         make_env(
             task, renderer="raster", image_size=16, observations=("image", "proprio", "state")
@@ -129,26 +127,26 @@ def test_a_seed_gives_the_same_episode_whatever_is_observed(task):
         env.close()
 
 
-def test_info_tells_success_distance_and_terms(blind):
-    _, info = blind.reset(seed=0)
+def test_info_has_success_distance_and_reward_terms(env_without_images):
+    _, info = env_without_images.reset(seed=0)
     assert set(info) == {"success", "distance", "reward_terms"}
-    physics, task = blind._physics, blind.task
+    physics, task = env_without_images._physics, env_without_images.task
     for distance in (0.03, 0.07):
-        blind.reset(seed=0)
+        env_without_images.reset(seed=0)
         physics.data.qpos[-7:-4] = task.tool_center_point(physics) - (0.0, 0.0, distance)
         physics.forward()
-        _, reward, _, _, info = blind.step(ACTION)
+        _, reward, _, _, info = env_without_images.step(ACTION)
         assert info["success"] == float(info["distance"] <= 0.05)
         assert info["success"] == (distance < 0.05)
         assert reward == sum(info["reward_terms"].values())
 
 
-def test_actions_are_joint_velocities_and_clipped(blind):
-    blind.reset(seed=0)
-    control = blind._physics.data.ctrl
-    greatest = blind._physics.model.actuator_ctrlrange[:, 1]
+def test_actions_are_clipped_joint_velocities(env_without_images):
+    env_without_images.reset(seed=0)
+    control = env_without_images._physics.data.ctrl
+    greatest = env_without_images._physics.model.actuator_ctrlrange[:, 1]
     for action, share in ((ACTION + 1, 1.0), (ACTION - 0.5, -0.5), (ACTION + 1.2, 1.0)):
-        blind.step(action)
+        env_without_images.step(action)
         np.testing.assert_allclose(control, share * greatest)
     assert greatest[:6] == pytest.approx(np.deg2rad([36, 36, 36, 48, 48, 48]))
 
@@ -167,13 +165,13 @@ def test_actions_are_joint_velocities_and_clipped(blind):
         (None, "not an array of numbers"),
     ],
 )
-def test_a_bad_action_moves_nothing(blind, action, message):
-    blind.reset(seed=0)
-    before = blind._physics.get_state()
+def test_an_invalid_action_does_not_change_the_simulation(env_without_images, action, message):
+    env_without_images.reset(seed=0)
+    before = env_without_images._physics.get_state()
     with pytest.raises(MerlError, match=message) as error:
-        blind.step(action)
+        env_without_images.step(action)
     assert "\n" not in str(error.value)
-    np.testing.assert_array_equal(blind._physics.get_state(), before)
+    np.testing.assert_array_equal(env_without_images._physics.get_state(), before)
 
 
 @pytest.mark.parametrize(
@@ -210,18 +208,18 @@ def test_a_bad_action_moves_nothing(blind, action, message):
         ("reach_duplo", {"renderer": "raster", "render_mode": "human"}, "render_mode 'human'"),
     ],
 )
-def test_a_bad_setting_gets_one_clear_line(task, config, message):
+def test_an_invalid_setting_is_rejected_in_one_line(task, config, message):
     with pytest.raises(MerlError, match=message) as error:
         make_env(task, **config)
     assert "\n" not in str(error.value)
 
 
-def test_what_is_not_asked_for_is_not_computed(blind, monkeypatch):
+def test_keys_that_are_not_requested_are_not_computed(env_without_images, monkeypatch):
     def refuse(*_):
         raise AssertionError
 
-    monkeypatch.setattr(blind, "_picture", refuse)
-    observation, _ = blind.reset(seed=0)
+    monkeypatch.setattr(env_without_images, "_image", refuse)
+    observation, _ = env_without_images.reset(seed=0)
     assert list(observation) == ["proprio", "state"]
     env = make_env("reach_duplo", renderer="raster", image_size=16, observations=("image",))
     monkeypatch.setattr(env.task, "proprio", refuse)
@@ -246,7 +244,7 @@ def test_reset_after_close_opens_the_environment_again():
     env.close()
 
 
-def test_reset_after_close_draws_on_from_the_same_generator():
+def test_reset_after_close_continues_the_same_generator():
     starts = []
     for closes in (False, True):
         env = make_env("reach_duplo", renderer="raster", observations=("state",))
@@ -275,14 +273,14 @@ def test_gymnasium_makes_every_task():
         env.close()
 
 
-def test_auto_renderer_is_replaced_before_anything_records_it():
+def test_auto_renderer_is_replaced_in_the_config():
     assert EnvConfig().renderer == EnvConfig(renderer="auto").renderer == "raster"
     assert EnvConfig(renderer="gl").renderer == "gl"
     with pytest.raises(MerlError, match="renderer"):
         EnvConfig(renderer="vulkan")
 
 
-def test_every_setting_is_a_plain_value():
+def test_defaults_of_the_settings():
     assert {field.name: field.default for field in fields(EnvConfig)} == {
         "renderer": "auto",
         "image_size": 84,

@@ -1,4 +1,4 @@
-"""The rasteriser used from several threads, and with what it cannot draw."""
+"""The rasteriser in several threads, and with invalid arguments and models."""
 
 import itertools
 import threading
@@ -26,25 +26,25 @@ from merl.envs.raster.renderer import RasterRenderer
         ({"size": 8.5}, "size is 8.5: give a whole number"),
     ],
 )
-def test_sizes_and_samples_out_of_range_are_refused(every_geom, settings, message):
+def test_sizes_and_samples_out_of_range_are_rejected(every_geom, settings, message):
     with pytest.raises(MerlError, match=message) as error:
         RasterRenderer(every_geom, "view", **{"size": 32, **settings})
     assert "\n" not in str(error.value)
 
 
 def in_two_threads(work):
-    """What `work(0)` and `work(1)` return, called in two threads at the same time."""
+    """Return the results of `work(0)` and `work(1)`, called in two threads at the same time."""
     together = threading.Barrier(2)
 
-    def begin(index):
+    def start(index):
         together.wait()
         return work(index)
 
     with ThreadPoolExecutor(2) as threads:
-        return list(threads.map(begin, range(2)))
+        return list(threads.map(start, range(2)))
 
 
-def test_two_threads_with_a_renderer_each_draw_what_one_draws(every_geom):
+def test_two_threads_with_a_renderer_each_draw_the_same_as_one(every_geom):
     expected = RasterRenderer(every_geom, "view", 48).render()
 
     def draw(_):
@@ -55,7 +55,7 @@ def test_two_threads_with_a_renderer_each_draw_what_one_draws(every_geom):
         np.testing.assert_array_equal(image, expected)
 
 
-def test_two_threads_with_one_renderer_draw_what_one_draws(every_geom):
+def test_two_threads_with_one_renderer_draw_the_same_as_one(every_geom):
     renderer = RasterRenderer(every_geom, "view", 48)
     image, depth = renderer.render(), renderer.render_depth()
     for images in in_two_threads(lambda _: [renderer.render() for _ in range(300)]):
@@ -65,14 +65,14 @@ def test_two_threads_with_one_renderer_draw_what_one_draws(every_geom):
         np.testing.assert_array_equal(another.submit(renderer.render_depth).result(), depth)
 
 
-def test_one_thread_at_a_time_compiles(every_geom, monkeypatch):
-    """Warp crashes where several threads compile its kernels at the same time."""
-    alone, record = threading.Lock(), RasterRenderer._record
+def test_only_one_thread_at_a_time_compiles(every_geom, monkeypatch):
+    """Warp crashes if several threads compile its kernels at the same time."""
+    compiling, record = threading.Lock(), RasterRenderer._record
 
     def record_alone(renderer):
-        assert alone.acquire(blocking=False), "two threads compile"
+        assert compiling.acquire(blocking=False), "two threads compile"
         time.sleep(0.05)  # enough for the other thread to arrive
-        alone.release()
+        compiling.release()
         return record(renderer)
 
     monkeypatch.setattr(RasterRenderer, "_record", record_alone)
@@ -111,7 +111,7 @@ def test_one_thread_at_a_time_compiles(every_geom, monkeypatch):
     ],
     ids=["hfield", "sdf", "flex", "no such camera", "orthographic"],
 )
-def test_what_cannot_be_drawn_is_named_in_one_line(model, message):
+def test_unsupported_models_are_rejected_in_one_line(model, message):
     physics = dm_mujoco.Physics.from_xml_string(f"<mujoco>{model}</mujoco>")
     with pytest.raises(MerlError, match=message) as error:
         RasterRenderer(physics, "view", 32)

@@ -1,4 +1,4 @@
-"""The rasteriser beside OpenGL and MuJoCo's own rays, on the tasks and on every geom type."""
+"""The rasteriser compared with OpenGL and MuJoCo's rays, on the tasks and on every geom type."""
 
 import mujoco
 import numpy as np
@@ -13,7 +13,7 @@ from merl.tasks.jaco import CAMERA
 
 @pytest.fixture(params=TASKS)
 def task(request):
-    """A physics of each task after some random steps."""
+    """The physics of each task after some random steps."""
     env = make_env(request.param, renderer="raster", observations=("proprio",))
     env.reset(seed=3)
     action = np.random.default_rng(2).uniform(-1, 1, 9).astype(np.float32)
@@ -24,7 +24,7 @@ def task(request):
 
 
 def rays(physics, camera, size, visible=(1, 1, 1, 0, 0, 0)):
-    """Depth (m) and geom of each pixel's centre, by MuJoCo's own ray casting; inf and -1: none."""
+    """Return depth (m) and geom at each pixel's centre from MuJoCo's rays; inf and -1 if none."""
     model, data = physics.model.ptr, physics.data.ptr
     number = model.camera(camera).id
     eye, axes = data.cam_xpos[number], data.cam_xmat[number].reshape(3, 3)
@@ -43,50 +43,50 @@ def rays(physics, camera, size, visible=(1, 1, 1, 0, 0, 0)):
     return depth, geom
 
 
-def test_depth_and_geoms_are_those_of_mujocos_rays(every_geom):
+def test_depth_and_geoms_equal_those_of_mujocos_rays(every_geom):
     renderer = RasterRenderer(every_geom, "view", 48)
     depth, geom = rays(every_geom, "view", 48)
-    mine = renderer.render_segmentation()
-    assert set(np.unique(mine)) == {-1, *range(8)}  # every geom is seen but the two hidden ones
-    same = mine == geom
+    drawn_geoms = renderer.render_segmentation()
+    assert set(np.unique(drawn_geoms)) == {-1, *range(8)}  # all geoms but the two hidden ones
+    same = drawn_geoms == geom
     assert same.mean() > 0.985  # curved geoms are drawn with flat triangles
     seen = same & (geom >= 0)
     np.testing.assert_allclose(renderer.render_depth()[seen], depth[seen], rtol=0.01)
-    assert np.isinf(renderer.render_depth()[mine < 0]).all()
+    assert np.isinf(renderer.render_depth()[drawn_geoms < 0]).all()
 
 
 def test_triangles_are_clipped_at_the_near_plane(every_geom):
-    """The camera stands over a box that reaches behind it: its far part is still drawn."""
+    """The camera is above a box that extends behind it; the part in front is still drawn."""
     renderer = RasterRenderer(every_geom, "inside", 48)
     depth, geom = rays(every_geom, "inside", 48)
-    mine = renderer.render_segmentation()
-    under = 7
-    assert (geom == under).sum() > 100
-    assert ((mine == under) == (geom == under)).mean() > 0.99
-    near = (mine == under) & (geom == under)
+    drawn_geoms = renderer.render_segmentation()
+    box_geom = 7
+    assert (geom == box_geom).sum() > 100
+    assert ((drawn_geoms == box_geom) == (geom == box_geom)).mean() > 0.99
+    near = (drawn_geoms == box_geom) & (geom == box_geom)
     np.testing.assert_allclose(renderer.render_depth()[near], depth[near], rtol=1e-3)
 
 
-def opengls(physics, camera, size):
-    """Depth (m) and geom of each pixel, as OpenGL draws them; -1: no geom."""
+def opengl_depth_and_geoms(physics, camera, size):
+    """Return depth (m) and geom of each pixel from OpenGL; -1 if there is no geom."""
     labels = physics.render(size, size, camera_id=camera, segmentation=True)
     geoms = np.where(labels[..., 1] == mujoco.mjtObj.mjOBJ_GEOM, labels[..., 0], -1)
     return physics.render(size, size, camera_id=camera, depth=True), geoms
 
 
-def assert_close(depth, theirs, seen):
-    """Nearly everywhere: OpenGL's samples lie elsewhere in a pixel, which counts at edges."""
-    assert (np.abs(depth - theirs)[seen] < 0.05 * theirs[seen]).mean() > 0.95
+def assert_close(depth, expected, seen):
+    """Check depths nearly everywhere; edges differ, as OpenGL samples pixels at other points."""
+    assert (np.abs(depth - expected)[seen] < 0.05 * expected[seen]).mean() > 0.95
 
 
 @pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize("camera", ["view", "inside"])
-def test_every_geom_has_opengls_silhouette_and_depth(every_geom, camera):
+def test_every_geom_has_the_silhouette_and_depth_of_opengl(every_geom, camera):
     renderer = RasterRenderer(every_geom, camera, 84)
-    depth, geoms = opengls(every_geom, camera, 84)
-    mine = renderer.render_segmentation()
-    assert (mine == geoms).mean() > 0.98
-    seen = (mine == geoms) & (geoms >= 0)
+    depth, geoms = opengl_depth_and_geoms(every_geom, camera, 84)
+    drawn_geoms = renderer.render_segmentation()
+    assert (drawn_geoms == geoms).mean() > 0.98
+    seen = (drawn_geoms == geoms) & (geoms >= 0)
     assert seen.mean() > 0.3
     assert_close(renderer.render_depth(), depth, seen)
 
@@ -104,8 +104,8 @@ GEOMS = {
 
 @pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize("geom", GEOMS)
-def test_the_near_plane_cuts_every_geom_as_in_opengl(geom):
-    """The camera grazes the geom, nearer to it than the near plane."""
+def test_the_near_plane_clips_every_geom_as_in_opengl(geom):
+    """The camera is closer to the geom than the near plane."""
     physics = dm_mujoco.Physics.from_xml_string(
         f"""<mujoco><statistic extent="1"/><visual><map znear="0.2"/></visual>
         <asset><mesh name="pyramid" vertex="-1 -1 0  1 -1 0  1 1 0  -1 1 0  0 0 0.3"/></asset>
@@ -114,28 +114,28 @@ def test_the_near_plane_cuts_every_geom_as_in_opengl(geom):
     )
     physics.forward()
     renderer = RasterRenderer(physics, "view", 64)
-    depth, geoms = opengls(physics, "view", 64)
-    mine = renderer.render_segmentation()
+    depth, geoms = opengl_depth_and_geoms(physics, "view", 64)
+    drawn_geoms = renderer.render_segmentation()
     assert 0.03 < (geoms >= 0).mean() < 0.97
     assert depth[geoms >= 0].min() < 0.21  # the near plane lies at 0.2 m
-    assert (mine == geoms).mean() > 0.98
-    seen = (mine == geoms) & (geoms >= 0)
+    assert (drawn_geoms == geoms).mean() > 0.98
+    seen = (drawn_geoms == geoms) & (geoms >= 0)
     assert_close(renderer.render_depth(), depth, seen)
     physics.free()
 
 
 @pytest.mark.usefixtures("opengl")
-def test_every_geom_has_opengls_colours(every_geom):
+def test_every_geom_has_the_colours_of_opengl(every_geom):
     for samples, bar in ((1, 5.0), (2, 4.0)):
-        mine = RasterRenderer(every_geom, "view", 84, samples).render().astype(int)
-        theirs = every_geom.render(84, 84, camera_id="view").astype(int)
-        assert np.abs(mine - theirs).mean() < bar
+        image = RasterRenderer(every_geom, "view", 84, samples).render().astype(int)
+        expected = every_geom.render(84, 84, camera_id="view").astype(int)
+        assert np.abs(image - expected).mean() < bar
 
 
 @pytest.mark.usefixtures("opengl")
-def test_tasks_look_as_opengl_draws_them(task):
+def test_images_of_tasks_are_close_to_opengl(task):
     drawn = task.render(84, 84, camera_id=CAMERA.name).astype(int)
-    depth, geoms = opengls(task, CAMERA.name, 84)
+    depth, geoms = opengl_depth_and_geoms(task, CAMERA.name, 84)
     for samples in (1, 2):
         renderer = RasterRenderer(task, CAMERA.name, 84, samples)
         assert np.abs(renderer.render().astype(int) - drawn).mean() < 4.0
@@ -156,13 +156,13 @@ def test_samples_are_the_box_average_of_a_larger_image(every_geom, size, samples
     image = RasterRenderer(every_geom, "view", size, samples).render()
     larger = RasterRenderer(every_geom, "view", size * samples).render()
     np.testing.assert_allclose(image, box_average(larger, samples), atol=1)
-    if samples > 1:  # and not one of the samples
+    if samples > 1:  # the image is not simply one of the samples
         assert np.abs(image - larger[::samples, ::samples].astype(int)).mean() > 3
 
 
 @pytest.mark.parametrize(("size", "samples"), [(24, 3), (32, 2), (32, 4)])
 def test_samples_of_an_environment_average_its_larger_image(size, samples):
-    """And so at every step; the picture for people is not averaged."""
+    """The images of every step are averages; the image from `render()` is not averaged."""
     settings = {"renderer": "raster", "render_size": 64, "render_mode": "rgb_array"}
     small = make_env("move_box", image_size=size, samples=samples, **settings)
     larger = make_env("move_box", image_size=size * samples, **settings)
@@ -185,8 +185,8 @@ def test_depth_of_a_task_is_exact(task):
     np.testing.assert_allclose(renderer.render_depth()[same], depth[same], rtol=5e-3)
 
 
-def test_shadows_fall_and_move(every_geom):
-    """The ball's shadow on the floor is darker than the floor beside it."""
+def test_shadows_darken_the_image(every_geom):
+    """With shadows, a part of the image is darker, and no pixel is brighter."""
     renderer = RasterRenderer(every_geom, "view", 84)
     lit = renderer.render()
     model = every_geom.model.ptr
@@ -198,7 +198,7 @@ def test_shadows_fall_and_move(every_geom):
     assert (bright >= lit).all()
 
 
-def test_a_moved_camera_and_light_are_seen(every_geom):
+def test_a_moved_camera_or_light_changes_the_image(every_geom):
     renderer = RasterRenderer(every_geom, "view", 48)
     before = renderer.render()
     np.testing.assert_array_equal(renderer.render(), before)

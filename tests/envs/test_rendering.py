@@ -1,4 +1,4 @@
-"""Both renderers, together and each where the other cannot work."""
+"""Both renderers: compared with each other, and each one where the other cannot work."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ from merl.envs import make_env, warp_runtime
 @pytest.fixture(scope="module")
 def raster_env():
     env = make_env("reach_duplo", renderer="raster", render_mode="rgb_array")
-    env.reset()  # compiles, so that interpreters started later have nothing to say
+    env.reset()  # compiles, so that later interpreters print nothing
     yield env
     env.close()
 
@@ -30,7 +30,7 @@ def gl_env(opengl):
 
 
 def run(code, **environment):
-    """Run code in a fresh interpreter, where no variable chooses an OpenGL."""
+    """Run code in a new interpreter, without environment variables that select an OpenGL."""
     inherited = {name: value for name, value in os.environ.items() if "GL" not in name}
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
@@ -52,61 +52,61 @@ assert env.render().shape == (480, 480, 3)
 """
 
 
-def test_gl_is_dm_controls_camera_bit_for_bit(gl_env):
-    theirs = manipulation.load("reach_duplo_vision")
-    spec = theirs.action_spec()
+def test_gl_equals_dm_controls_camera_bit_for_bit(gl_env):
+    reference = manipulation.load("reach_duplo_vision")
+    spec = reference.action_spec()
     noise = np.random.RandomState(0)
     for seed in range(2):
         observation, _ = gl_env.reset(seed=seed)
-        # The number that our reset drew is where dm_control's episode starts.
+        # Our reset draws the seed of dm_control's episode.
         start = np.random.default_rng(seed).integers(2**32, dtype=np.uint32)
-        theirs._random_state = np.random.RandomState(start)
-        timestep = theirs.reset()
+        reference._random_state = np.random.RandomState(start)
+        timestep = reference.reset()
         np.testing.assert_array_equal(observation["image"], timestep.observation["front_close"][0])
         action = noise.uniform(-1, 1, 9)
-        timestep = theirs.step(spec.minimum + (action + 1) / 2 * (spec.maximum - spec.minimum))
+        timestep = reference.step(spec.minimum + (action + 1) / 2 * (spec.maximum - spec.minimum))
         observation = gl_env.step(action)[0]
         np.testing.assert_array_equal(observation["image"], timestep.observation["front_close"][0])
-    theirs.close()
+    reference.close()
 
 
 def test_raster_is_close_to_gl(gl_env, raster_env):
     for seed in range(3):
         drawn = gl_env.reset(seed=seed)[0]["image"].astype(int)
-        mine = raster_env.reset(seed=seed)[0]["image"].astype(int)
-        assert np.abs(drawn - mine).mean() < 8.0
+        rasterized = raster_env.reset(seed=seed)[0]["image"].astype(int)
+        assert np.abs(drawn - rasterized).mean() < 8.0
 
 
-def red(picture):
-    """Pixels of the brick's colour, (H, W) bool."""
-    r, g, b = np.moveaxis(picture.astype(int), -1, 0)
+def red(image):
+    """Return a mask of the pixels with the brick's colour, (H, W) bool."""
+    r, g, b = np.moveaxis(image.astype(int), -1, 0)
     return (r > 120) & (g < 60) & (b < 60)
 
 
-def black(picture):
-    """Pixels of the arm's colour, (H, W) bool."""
-    return (picture < 40).all(axis=-1)
+def black(image):
+    """Return a mask of the pixels with the arm's colour, (H, W) bool."""
+    return (image < 40).all(axis=-1)
 
 
 @pytest.mark.parametrize("renderer", ["raster", "gl"])
-def test_brick_and_arm_are_in_the_picture(renderer, request):
+def test_brick_and_arm_are_visible(renderer, request):
     env = request.getfixturevalue(f"{renderer}_env")
     for seed in range(5):
         small = env.reset(seed=seed)[0]["image"]
         large = env.render()
         assert small.shape == (84, 84, 3)
         assert large.shape == (480, 480, 3)
-        for picture in (small, large):
-            assert red(picture).sum() >= picture.shape[0] ** 2 * 3e-4  # the hand may cover some
-            assert black(picture).mean() > 0.02
-        # The camera looks along +y: a brick further to the right is further to the right here.
+        for image in (small, large):
+            assert red(image).sum() >= image.shape[0] ** 2 * 3e-4  # the hand may cover some
+            assert black(image).mean() > 0.02
+        # The camera looks along +y: a larger x of the brick is further to the right in the image.
         column = np.nonzero(red(large))[1].mean() / 480 - 0.5
         across = env.task.prop_position(env._physics)[0]
         assert abs(column - across) < 0.15
 
 
 @pytest.mark.parametrize("renderer", ["raster", "gl"])
-def test_the_mark_of_move_box_is_seen_in_both(renderer, request):
+def test_the_mark_of_move_box_is_visible(renderer, request):
     if renderer == "gl":
         request.getfixturevalue("opengl")
     env = make_env("move_box", renderer=renderer)
@@ -114,17 +114,17 @@ def test_the_mark_of_move_box_is_seen_in_both(renderer, request):
     def green_pixels(box):
         env._physics.data.qpos[-7:-4] = box
         env._physics.forward()
-        red, green, blue = np.moveaxis(env._picture(84).astype(int), 2, 0)
+        red, green, blue = np.moveaxis(env._image(84).astype(int), 2, 0)
         return int(((green > 2 * red) & (green > 2 * blue) & (green > 60)).sum())
 
     env.reset(seed=0)
     away, near = green_pixels((0.1, 0.1, 0.025)), green_pixels((0.01, -0.2, 0.025))
     env.close()
-    assert 110 < away < 190  # 140 or so, in 84 x 84
+    assert 110 < away < 190  # about 140 of 84 x 84
     assert 0.25 * away < near < 0.75 * away
 
 
-def test_pictures_are_new_arrays_and_follow_the_arm(raster_env):
+def test_images_are_new_arrays_and_show_the_motion_of_the_arm(raster_env):
     first = raster_env.reset(seed=0)[0]["image"]
     kept = first.copy()
     for _ in range(10):
@@ -134,8 +134,8 @@ def test_pictures_are_new_arrays_and_follow_the_arm(raster_env):
     np.testing.assert_array_equal(raster_env.reset(seed=0)[0]["image"], kept)
 
 
-def test_two_threads_see_what_one_sees():
-    def pictures(seed):
+def test_two_threads_get_the_same_images_as_one():
+    def images(seed):
         env = make_env("reach_duplo", renderer="raster", image_size=32)
         seen = [env.reset(seed=seed)[0]["image"]]
         seen += [env.step(np.ones(9, np.float32))[0]["image"] for _ in range(10)]
@@ -143,12 +143,12 @@ def test_two_threads_see_what_one_sees():
         return np.stack(seen)
 
     with ThreadPoolExecutor(2) as threads:
-        together = list(threads.map(pictures, [0, 1]))
+        together = list(threads.map(images, [0, 1]))
     for seed, seen in enumerate(together):
-        np.testing.assert_array_equal(seen, pictures(seed))
+        np.testing.assert_array_equal(seen, images(seed))
 
 
-def test_a_process_that_is_forked_after_a_picture_takes_pictures_too(raster_env):
+def test_a_forked_process_can_render(raster_env):
     done = run(
         """
         import multiprocessing
@@ -171,7 +171,7 @@ def test_a_process_that_is_forked_after_a_picture_takes_pictures_too(raster_env)
 
 @pytest.mark.parametrize("size", [16, 700])
 @pytest.mark.parametrize("renderer", ["raster", "gl"])
-def test_any_size(renderer, size, request):
+def test_small_and_large_images(renderer, size, request):
     if renderer == "gl":
         request.getfixturevalue("opengl")
     env = make_env("reach_duplo", renderer=renderer, image_size=16, render_size=size,
@@ -181,12 +181,12 @@ def test_any_size(renderer, size, request):
     env.close()
 
 
-def test_raster_needs_no_opengl_and_says_nothing_at_exit(raster_env):
+def test_raster_needs_no_opengl_and_prints_nothing_at_exit(raster_env):
     done = run(STEP.format(renderer="raster"), MUJOCO_GL="disabled")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_default_environment_works_where_the_opengl_asked_for_is_missing(raster_env):
+def test_the_default_environment_works_without_the_requested_opengl(raster_env):
     code = """
     import gymnasium, merl
     for env in (gymnasium.make("merl:merl/ReachDuplo-v0"), merl.make_env("reach_duplo")):
@@ -212,7 +212,7 @@ ctypes.util.find_library = lambda name: None if hidden(name) else find(name)
 """
 
 
-def test_gl_without_opengl_names_the_way_on():
+def test_gl_without_opengl_names_the_solutions():
     code = """
     from merl.core import MerlError
     from merl.envs import make_env
@@ -229,7 +229,7 @@ def test_gl_without_opengl_names_the_way_on():
         assert word in done.stdout
 
 
-def test_gl_says_nothing_at_exit_without_close(opengl):
+def test_gl_prints_nothing_at_exit_without_close(opengl):
     done = run(STEP.format(renderer="gl"))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
@@ -239,17 +239,17 @@ def test_gl_after_raster_in_one_process(opengl, raster_env):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_it_is_said_that_the_renderer_is_compiled(capsys):
-    said, shown = "merl: compiling the renderer, once, for 5 to 20 s\n", ""
+def test_slow_compiling_prints_a_notice(capsys):
+    notice, printed = "merl: compiling the renderer (only once, 5 to 20 s)\n", ""
     with warp_runtime.compiling(0.1):
-        while not shown:  # as compiling does, this takes processor time
-            shown = capsys.readouterr().err
-    assert shown == said
+        while not printed:  # like compiling, this loop takes processor time
+            printed = capsys.readouterr().err
+    assert printed == notice
 
 
-def test_on_a_busy_machine_loading_is_not_called_compiling(capsys):
+def test_waiting_for_a_busy_processor_prints_no_notice(capsys):
     with warp_runtime.compiling(0.2) as watch:
-        time.sleep(0.5)  # another process has the processor
+        time.sleep(0.5)  # as if another process had the processor
     watch.join()
     assert capsys.readouterr().err == ""
 
@@ -266,7 +266,7 @@ def test_raster_works_without_a_home(tmp_path):
     assert done.stderr == ""
 
 
-def test_importing_the_room_loads_no_simulator():
+def test_importing_merl_envs_loads_no_simulator():
     done = run(
         """
         import sys

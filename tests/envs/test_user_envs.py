@@ -1,4 +1,4 @@
-"""A user's own environment: found by name, brought into the agents' form, refused in one line."""
+"""User environments: found by name, converted for agents, or rejected in one line."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from merl.envs.user_env import adapt, load_module, make_user_env
 from merl.envs.wrappers import in_one_line
 
 
-class Given(gymnasium.Env[Any, Any]):
-    """Gives what it is told to."""
+class SpaceEnv(gymnasium.Env[Any, Any]):
+    """An environment that returns samples of its observation space."""
 
     def __init__(self, space: spaces.Space[Any], actions: spaces.Space[Any] | None = None) -> None:
         self.observation_space = space
@@ -32,7 +32,7 @@ class Given(gymnasium.Env[Any, Any]):
         return self.observation_space.sample(), {}
 
     def step(self, action: Any) -> Any:
-        self.acted = action
+        self.received_action = action
         return self.observation_space.sample(), np.float64(1.5), False, True, {"is_success": True}
 
 
@@ -60,7 +60,7 @@ def vector(n: int, dtype: type = np.float32) -> spaces.Box:
     ],
 )
 def test_observations_become_images_and_vectors(given: Any, taken: dict[str, Any]) -> None:
-    env = adapt(Given(given))
+    env = adapt(SpaceEnv(given))
     assert isinstance(env.observation_space, spaces.Dict)
     assert {key: space.shape for key, space in env.observation_space.items()} == taken
     for space in env.observation_space.values():
@@ -69,16 +69,16 @@ def test_observations_become_images_and_vectors(given: Any, taken: dict[str, Any
         assert env.observation_space.contains(observation)
 
 
-def test_channels_that_come_first_are_moved_not_mixed() -> None:
-    plain, own = Given(image(3, 20, 30)), adapt(Given(image(3, 20, 30)))
-    before, after = plain.reset()[0], own.reset()[0]["image"]
+def test_channels_first_images_become_channels_last() -> None:
+    plain, adapted = SpaceEnv(image(3, 20, 30)), adapt(SpaceEnv(image(3, 20, 30)))
+    before, after = plain.reset()[0], adapted.reset()[0]["image"]
     for channel in range(3):
         np.testing.assert_array_equal(after[..., channel], before[channel])
 
 
-def test_what_is_neither_image_nor_vector_is_left_out_with_a_reason() -> None:
+def test_other_keys_than_images_and_vectors_are_left_out_with_a_reason() -> None:
     space = spaces.Dict({"arm": vector(2), "gear": spaces.Discrete(3), "map": vector(4)})
-    env = adapt(Given(space))
+    env = adapt(SpaceEnv(space))
     assert env.get_wrapper_attr("left_out") == {
         "gear": "Discrete(3): give it as one-hot, a float32 box of 3 numbers"
     }
@@ -86,32 +86,32 @@ def test_what_is_neither_image_nor_vector_is_left_out_with_a_reason() -> None:
     assert set(env.reset()[0]) == {"arm", "map"}
 
 
-def test_actions_are_rescaled_and_success_is_found() -> None:
+def test_actions_are_rescaled_and_is_success_becomes_success() -> None:
     low, high = np.array([-2.0, 0.0]), np.array([2.0, 10.0])
-    given = Given(vector(2), spaces.Box(low, high, dtype=np.float64))
+    given = SpaceEnv(vector(2), spaces.Box(low, high, dtype=np.float64))
     rng = np.random.default_rng(0)
-    for _ in range(200):  # never beyond the bounds, by no rounding
+    for _ in range(200):  # rounding never exceeds the bounds
         ends = np.sort(rng.normal(size=(2, 2)).astype(np.float32), axis=0)
-        odd = Given(vector(2), spaces.Box(*ends))
-        own = adapt(odd)
-        own.reset(seed=0)
+        odd = SpaceEnv(vector(2), spaces.Box(*ends))
+        adapted = adapt(odd)
+        adapted.reset(seed=0)
         for action in (-np.ones(2, np.float32), np.ones(2, np.float32)):
-            own.step(action)
-            assert odd.action_space.contains(odd.acted)
+            adapted.step(action)
+            assert odd.action_space.contains(odd.received_action)
     env = adapt(given)
     assert env.action_space == spaces.Box(-1.0, 1.0, (2,), np.float32)
     env.reset(seed=0)
     for action, expected in (((-1, -1), low), ((0, 0), (0, 5)), ((1, 1), high)):
         _, reward, _, truncated, info = env.step(np.array(action, np.float32))
-        np.testing.assert_allclose(given.acted, expected)
+        np.testing.assert_allclose(given.received_action, expected)
     assert (reward, truncated, info["success"]) == (1.5, True, True)
 
 
 @pytest.mark.parametrize(
-    ("space", "actions", "says"),
+    ("space", "actions", "message"),
     [
         (vector(2), spaces.Discrete(4), r"actions are Discrete\(4\)"),
-        (vector(2), spaces.Box(-np.inf, np.inf, (2,)), "give them finite bounds"),
+        (vector(2), spaces.Box(-np.inf, np.inf, (2,)), "set finite bounds"),
         (vector(2), spaces.Box(-1, 1, (2, 2)), "a box of real numbers"),
         (vector(2), spaces.Box(-9, 9, (2,), np.int32), "a box of real numbers"),
         (spaces.Discrete(5), None, "neither an image"),
@@ -119,12 +119,12 @@ def test_actions_are_rescaled_and_success_is_found() -> None:
         (spaces.Box(-1, 1, (4, 4), np.float32), None, "neither an image"),
     ],
 )
-def test_what_cannot_be_learnt_in_is_refused(space: Any, actions: Any, says: str) -> None:
-    with pytest.raises(MerlError, match=says):
-        adapt(Given(space, actions))
+def test_unusable_spaces_are_rejected(space: Any, actions: Any, message: str) -> None:
+    with pytest.raises(MerlError, match=message):
+        adapt(SpaceEnv(space, actions))
 
 
-def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> None:
+def test_environments_are_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> None:
     assert make_user_env("merl.envs.dot:whole", "rgb_array").render_mode == "rgb_array"
     pendulum = make_user_env("Pendulum-v1")
     assert set(pendulum.observation_space) == {"state"}  # type: ignore[call-overload]
@@ -139,22 +139,22 @@ def test_it_is_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> 
     load_module("my_robot_here:make", tmp_path)
     assert make_user_env("my_robot_here:make").unwrapped.g == 1.0  # type: ignore[attr-defined]
     assert make_user_env("my_robot_here:Robot-v7", "rgb_array").render_mode is None
-    for task, says in {
+    for task, message in {
         "Pendulm-v1": "did you mean 'Pendulum-v1'",
         "reach_dulpo": "did you mean 'reach_duplo'",
         "zzz": "choose from reach_duplo, move_box, lift_box, or name a Gymnasium id",
-        "no_such_module:make": "name its folder in PYTHONPATH",
+        "no_such_module:make": "add its folder to PYTHONPATH",
         "my_robot_here:maker": "has no function 'maker'",
-        "my_robot_here:limit": "a function is needed",
-        "my_robot_here:number": "gave int",
+        "my_robot_here:limit": "must name a function",
+        "my_robot_here:number": "returned int",
         "CartPole-v1": "Discrete",
     }.items():
-        with pytest.raises(MerlError, match=says):
+        with pytest.raises(MerlError, match=message):
             make_user_env(task)
 
 
-class Lying(Given):
-    """Says uint8 and gives floats, or leaves a key out."""
+class WrongObservationEnv(SpaceEnv):
+    """Returns floats for a uint8 space, and leaves a key out."""
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         observation, info = super().reset(seed=seed)
@@ -163,18 +163,22 @@ class Lying(Given):
         return observation, info
 
 
-@pytest.mark.parametrize(("keys", "says"), [(("top",), "is of float64"), (("arm",), "lacks 'arm'")])
-def test_what_an_environment_gives_is_held_to_its_space(keys: tuple[str], says: str) -> None:
-    parts = {"top": image(20, 20, 3), "arm": vector(2)}
-    env = Lying(spaces.Dict(parts))
-    own = adapt(env)
-    own.modalities = {key: own.modalities[key] for key in keys}  # type: ignore[attr-defined]
-    with pytest.raises(MerlError, match=says):
-        own.reset()
+@pytest.mark.parametrize(
+    ("keys", "message"), [(("top",), "has dtype float64"), (("arm",), "lacks 'arm'")]
+)
+def test_observations_that_contradict_their_space_are_rejected(
+    keys: tuple[str], message: str
+) -> None:
+    spaces_by_key = {"top": image(20, 20, 3), "arm": vector(2)}
+    env = WrongObservationEnv(spaces.Dict(spaces_by_key))
+    adapted = adapt(env)
+    adapted.modalities = {key: adapted.modalities[key] for key in keys}  # type: ignore[attr-defined]
+    with pytest.raises(MerlError, match=message):
+        adapted.reset()
 
 
 @pytest.mark.parametrize("task", ["merl.envs.dot:whole", "merl.envs.dot:split"])
-def test_the_dot(task: str) -> None:
+def test_the_dot_environment(task: str) -> None:
     env = make_user_env(task, "rgb_array")
     check_env(env.unwrapped, skip_render_check=True)
     returns = {}
@@ -193,8 +197,8 @@ def test_the_dot(task: str) -> None:
     assert np.asarray(env.render())[..., 0].any()
 
 
-class Misgiving(Given):
-    """Gives from `reset` and `step` what it is told to."""
+class ScriptedEnv(SpaceEnv):
+    """An environment whose `reset` and `step` return given values."""
 
     def __init__(self, reset: Any = None, step: Any = None) -> None:
         super().__init__(spaces.Dict({"arm": vector(2), "eye": image(20, 30, 3)}))
@@ -211,10 +215,10 @@ class Misgiving(Given):
 
 
 @pytest.mark.parametrize(
-    ("step", "says"),
+    ("step", "message"),
     [
-        (lambda o: (o, 0.0, False, {}), "step gave 4 values: it must return observation, reward"),
-        (lambda o: None, "step gave NoneType"),
+        (lambda o: (o, 0.0, False, {}), "step returned 4 values: it must return observation, "),
+        (lambda o: None, "step returned NoneType"),
         (lambda o: (o, None, False, False, {}), "reward is None: it must be a number"),
         (lambda o: (o, np.zeros(2), False, False, {}), "reward is array"),
         (lambda o: (o, 0.0, np.zeros(2), False, {}), "terminated is array"),
@@ -222,20 +226,20 @@ class Misgiving(Given):
         (lambda o: (o, 0.0, False, False, {"reward_terms": [1]}), "must be a dict of numbers"),
         (lambda o: (o, 0.0, False, False, {"reward_terms": {"a": "b"}}), "reward term 'a' is 'b'"),
         (lambda o: (o, 0.0, False, False, {"success": np.zeros(2)}), "must be true or false"),
-        (lambda o: (None, 0.0, False, False, {}), "observation is of NoneType"),
+        (lambda o: (None, 0.0, False, False, {}), "observation is a NoneType"),
         (lambda o: ({"arm": o["arm"]}, 0.0, False, False, {}), "lacks 'eye'"),
         (lambda o: (o | {"arm": np.zeros(3)}, 0.0, False, False, {}), r"\(3,\), but its space"),
-        (lambda o: (o | {"arm": ["a", "b"]}, 0.0, False, False, {}), "'arm' holds something"),
+        (lambda o: (o | {"arm": ["a", "b"]}, 0.0, False, False, {}), "'arm' contains a value"),
         (lambda o: (o | {"eye": np.zeros((31, 32, 3), np.uint8)}, 0.0, False, False, {}),
          r"'eye' has shape \(31, 32, 3\)"),
-        (lambda o: 1 / 0, r"step raised ZeroDivisionError: division by zero \(test_own.py, line"),
-        (lambda o: sys.exit("no arm"), r"step raised SystemExit: no arm \(test_own.py, line"),
+        (lambda o: 1 / 0, r"raised ZeroDivisionError: division by zero \(test_user_envs.py, line"),
+        (lambda o: sys.exit("no arm"), r"step raised SystemExit: no arm \(test_user_envs.py, line"),
     ],
 )  # fmt: skip
-def test_what_is_no_step_is_told(step: Any, says: str) -> None:
-    env = adapt(Misgiving(step=step))
+def test_invalid_step_results_are_rejected(step: Any, message: str) -> None:
+    env = adapt(ScriptedEnv(step=step))
     env.reset()
-    with pytest.raises(EnvironmentFailed, match=says):
+    with pytest.raises(EnvironmentFailed, match=message):
         env.step(np.zeros(2, np.float32))
 
 
@@ -247,12 +251,14 @@ def interrupted(observation: Any) -> Any:
     ("handler", "raised"),
     [
         (signal.default_int_handler, KeyboardInterrupt),  # the user's Ctrl-C may have raised it
-        (signal.SIG_IGN, EnvironmentFailed),  # as in a worker's process
-        (lambda *_: None, EnvironmentFailed),  # as in a run
+        (signal.SIG_IGN, EnvironmentFailed),  # as in a worker process
+        (lambda *_: None, EnvironmentFailed),  # as during training
     ],
 )
-def test_a_keyboard_interrupt_of_its_own_is_told(handler: Any, raised: type[BaseException]) -> None:
-    env = adapt(Misgiving(step=interrupted))
+def test_keyboard_interrupt_is_an_error_where_ctrl_c_does_not_raise_it(
+    handler: Any, raised: type[BaseException]
+) -> None:
+    env = adapt(ScriptedEnv(step=interrupted))
     env.reset()
     former = signal.signal(signal.SIGINT, handler)
     try:
@@ -262,31 +268,31 @@ def test_a_keyboard_interrupt_of_its_own_is_told(handler: Any, raised: type[Base
         signal.signal(signal.SIGINT, former)
 
 
-def test_what_is_usual_is_taken() -> None:
-    env = adapt(Misgiving(step=lambda o: (o, np.ones(1), np.bool_(True), 0, {"lap": None})))
+def test_common_types_of_step_results_are_accepted() -> None:
+    env = adapt(ScriptedEnv(step=lambda o: (o, np.ones(1), np.bool_(True), 0, {"lap": None})))
     env.reset()
     _, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
     assert (reward, terminated, truncated, info) == (1.0, True, False, {"lap": None})
 
 
-def test_an_old_reset_is_told() -> None:
-    given = Misgiving(reset=({"arm": np.zeros(2)},))
-    with pytest.raises(EnvironmentFailed, match="reset gave 1 value: it must return observation"):
+def test_reset_without_info_is_rejected() -> None:
+    given = ScriptedEnv(reset=({"arm": np.zeros(2)},))
+    with pytest.raises(EnvironmentFailed, match="reset returned 1 value: it must return obs"):
         adapt(given).reset()
 
 
-def test_no_motor_is_given_what_is_no_number() -> None:
-    given = Given(vector(2))
+def test_nan_actions_do_not_reach_the_environment() -> None:
+    given = SpaceEnv(vector(2))
     env = adapt(given)
     env.reset()
-    with pytest.raises(NotFinite, match="the environment is not given it"):
+    with pytest.raises(NotFinite, match="not sent to the environment"):
         env.step(np.array([0.0, np.nan], np.float32))
-    assert not hasattr(given, "acted")
+    assert not hasattr(given, "received_action")
 
 
-def test_keys_are_strings_and_spaces_are_there() -> None:
-    with pytest.raises(MerlError, match="has the key 1: name it with a string"):
-        adapt(Given(spaces.Dict({1: vector(2)})))  # type: ignore[dict-item]
+def test_keys_that_are_not_strings_and_missing_spaces_are_rejected() -> None:
+    with pytest.raises(MerlError, match="has the key 1: use a string as key"):
+        adapt(SpaceEnv(spaces.Dict({1: vector(2)})))  # type: ignore[dict-item]
 
     class Bare(gymnasium.Env[Any, Any]):
         pass
@@ -295,8 +301,8 @@ def test_keys_are_strings_and_spaces_are_there() -> None:
         adapt(Bare())
 
 
-def test_a_close_that_fails_stops_nothing() -> None:
-    class Stuck(Given):
+def test_a_failing_close_only_warns() -> None:
+    class Stuck(SpaceEnv):
         def close(self) -> None:
             raise OSError("the port is busy")
 
@@ -304,8 +310,8 @@ def test_a_close_that_fails_stops_nothing() -> None:
         adapt(Stuck(vector(2))).close()
 
 
-def place_of(path: Path, code: str) -> str:
-    """What is said of the exception that this file's `step` raises."""
+def described_error(path: Path, code: str) -> str:
+    """Return the description of the exception that `step` in this file raises."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(code)
     names: dict[str, Any] = {}
@@ -329,22 +335,22 @@ def place_of(path: Path, code: str) -> str:
         ("raise OSError('servo 3')", "OSError: servo 3"),
     ],
 )
-def test_the_place_of_an_error_is_the_last_one_in_a_file_of_the_users(
+def test_errors_name_the_last_line_in_the_users_files(
     inner: str, raised: str, tmp_path: Path
 ) -> None:
-    told = place_of(tmp_path / "arm.py", f"def step():\n    {inner}\n")
-    assert told.startswith(raised)
-    assert told.endswith("(arm.py, line 2)")
+    description = described_error(tmp_path / "arm.py", f"def step():\n    {inner}\n")
+    assert description.startswith(raised)
+    assert description.endswith("(arm.py, line 2)")
 
 
-def test_a_place_that_cannot_be_opened_is_not_named(tmp_path: Path) -> None:
+def test_errors_name_no_line_in_packages_merl_or_missing_files(tmp_path: Path) -> None:
     code = "def step():\n    raise OSError('servo 3')\n"
     installed = tmp_path / "lib" / "site-packages" / "driver.py"
-    assert "driver.py" not in place_of(installed, code)
-    assert place_of(tmp_path / "merl_arm.py", code).endswith("(merl_arm.py, line 2)")
+    assert "driver.py" not in described_error(installed, code)
+    assert described_error(tmp_path / "merl_arm.py", code).endswith("(merl_arm.py, line 2)")
     with patch("merl.envs.wrappers.__file__", str(tmp_path / "merl" / "envs" / "wrappers.py")):
-        assert "dot.py" not in place_of(tmp_path / "merl" / "dot.py", code)
-        assert place_of(tmp_path / "merl_arm" / "arm.py", code).endswith("(arm.py, line 2)")
+        assert "dot.py" not in described_error(tmp_path / "merl" / "dot.py", code)
+        assert described_error(tmp_path / "merl_arm" / "arm.py", code).endswith("(arm.py, line 2)")
     (tmp_path / "gone.py").write_text(code)
     names: dict[str, Any] = {}
     exec(compile(code, str(tmp_path / "gone.py"), "exec"), names)
@@ -354,15 +360,15 @@ def test_a_place_that_cannot_be_opened_is_not_named(tmp_path: Path) -> None:
     assert "gone.py" not in in_one_line(caught.value)
 
 
-class Unspeakable(BaseException):
-    """Neither an Exception, nor one that can be told."""
+class UnprintableError(BaseException):
+    """An exception that is not an `Exception`, and whose text cannot be read."""
 
     def __str__(self) -> str:
         raise RuntimeError
 
 
-def _unspeakable() -> None:
-    raise Unspeakable
+def raise_unprintable() -> None:
+    raise UnprintableError
 
 
 class LostCamera(dict[str, Any]):
@@ -371,16 +377,16 @@ class LostCamera(dict[str, Any]):
 
 
 @pytest.mark.parametrize(
-    ("step", "says"),
+    ("step", "message"),
     [
-        (lambda o: _unspeakable(), r"step raised Unspeakable \(test_own.py, line"),
+        (lambda o: raise_unprintable(), r"step raised UnprintableError \(test_user_envs.py, line"),
         (lambda o: (LostCamera(o), 0.0, False, False, {}), "raised RuntimeError: camera lost"),
         (lambda o: (o, 0.0, False, False, LostCamera(success=True)), "RuntimeError: camera lost"),
     ],
 )
-def test_whatever_user_code_raises_is_one_line(step: Any, says: str) -> None:
-    env = adapt(Misgiving(step=step))
+def test_every_exception_of_user_code_is_reported_in_one_line(step: Any, message: str) -> None:
+    env = adapt(ScriptedEnv(step=step))
     env.reset()
-    with pytest.raises(EnvironmentFailed, match=says) as caught:
+    with pytest.raises(EnvironmentFailed, match=message) as caught:
         env.step(np.zeros(2, np.float32))
     assert len(str(caught.value).splitlines()) == 1

@@ -1,4 +1,4 @@
-"""What a user's environment returns is converted where its meaning is clear, else refused."""
+"""Values from a user's environment are converted if their meaning is clear, else rejected."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NEITHER = (
 
 
 @pytest.mark.parametrize("key", ["success", "is_success"])
-def test_success_is_true_or_false_in_the_usual_forms(key: str) -> None:
+def test_common_forms_of_success_become_true_or_false(key: str) -> None:
     for values, expected in ((TRUE, True), (FALSE, False)):
         for value in values:
             for form in (value, {"task": value}, {"task": value, "grasp": "?"}):
@@ -39,7 +39,7 @@ def test_success_is_true_or_false_in_the_usual_forms(key: str) -> None:
 
 @pytest.mark.parametrize("key", ["success", "is_success"])
 @pytest.mark.parametrize("value", NEITHER, ids=str)
-def test_any_other_success_is_refused_in_one_line(key: str, value: Any) -> None:
+def test_other_forms_of_success_are_rejected_in_one_line(key: str, value: Any) -> None:
     with pytest.raises(EnvironmentFailed) as caught:
         to_info({key: value})
     assert f'info["{key}"]' in str(caught.value)
@@ -48,20 +48,20 @@ def test_any_other_success_is_refused_in_one_line(key: str, value: Any) -> None:
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_success_comes_before_is_success_and_may_be_absent() -> None:
+def test_success_takes_precedence_over_is_success_and_is_optional() -> None:
     assert to_info({"success": 0, "is_success": True})["success"] is False
     assert "success" not in to_info({"lap": 3})
 
 
 @pytest.mark.parametrize("value", ["False", np.nan, None, 0.5, [True, False], {"task": True}, 2])
-def test_an_end_is_true_or_false(value: Any) -> None:
+def test_terminated_must_be_true_or_false(value: Any) -> None:
     with pytest.raises(EnvironmentFailed, match=r"terminated is .*: it must be true or false"):
         to_bool("terminated", value)
     assert to_bool("terminated", np.array([1])) is True
 
 
 @pytest.mark.parametrize(
-    ("value", "says"),
+    ("value", "message"),
     [
         (None, "reward is None: it must be a number"),
         ("1.5", "reward is '1.5': it must be a number"),
@@ -72,31 +72,31 @@ def test_an_end_is_true_or_false(value: Any) -> None:
         (1j, "it must be a number"),
     ],
 )
-def test_a_reward_is_one_number(value: Any, says: str) -> None:
-    with pytest.raises(EnvironmentFailed, match=says) as caught:
+def test_a_reward_must_be_one_number(value: Any, message: str) -> None:
+    with pytest.raises(EnvironmentFailed, match=message) as caught:
         to_number("reward", value)
     assert len(str(caught.value)) < 250
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_masked_values_are_refused() -> None:
+def test_masked_values_are_rejected() -> None:
     with pytest.raises(EnvironmentFailed, match="'arm' has masked values: fill them"):
         to_array("observation 'arm'", np.ma.masked_array([0.0, 999.0], mask=[0, 1]))
     assert to_array("x", np.ma.masked_array([0.0, 1.0], mask=[0, 0])).tolist() == [0.0, 1.0]
 
 
-def test_numbers_in_an_object_array_are_numbers() -> None:
+def test_numbers_in_an_object_array_are_converted() -> None:
     assert to_array("x", np.array([0.5, 1], object)).tolist() == [0.5, 1.0]
 
 
 def test_a_reward_may_be_an_array_of_one_or_a_tensor() -> None:
     for value in (2, np.float32(2), [2.0], np.full((1, 1), 2), torch.tensor(2.0).requires_grad_()):
         assert to_number("reward", value) == 2.0
-    assert np.isnan(to_number("reward", np.nan))  # the run's guard names it, with the step
+    assert np.isnan(to_number("reward", np.nan))  # the run's guard reports it, with the step
 
 
-class Unfriendly:
-    """Fails at whatever is asked of it."""
+class UnreadableValue:
+    """A value that raises on conversion and on repr."""
 
     def __array__(self, *_: Any, **__: Any) -> Any:
         raise RuntimeError("the device is busy\nfor a while")
@@ -120,11 +120,11 @@ class Unfriendly:
         torch.zeros(2, device="meta"),
         torch.eye(2).to_sparse(),
         [torch.zeros(2), torch.zeros(3)],
-        Unfriendly(),
+        UnreadableValue(),
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_an_observation_that_is_not_numbers_is_named(value: Any) -> None:
+def test_observations_that_are_not_numbers_are_rejected_by_name(value: Any) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(EnvironmentFailed, match="observation 'arm'") as caught:
@@ -133,7 +133,7 @@ def test_an_observation_that_is_not_numbers_is_named(value: Any) -> None:
     assert len(str(caught.value)) < 400
 
 
-def test_tensors_are_detached_and_brought_to_the_host() -> None:
+def test_tensors_are_detached_and_copied_to_the_host() -> None:
     for tensor in (
         torch.ones(2, requires_grad=True),
         torch.ones(2, dtype=torch.bfloat16, requires_grad=True),
@@ -144,13 +144,13 @@ def test_tensors_are_detached_and_brought_to_the_host() -> None:
         np.testing.assert_array_equal(to_array("x", tensor), [1.0, 1.0])
 
 
-class OnADevice:
-    """As a tensor on a GPU: NumPy cannot read it before it is detached and copied."""
+class DeviceTensor:
+    """Like a tensor on a GPU: NumPy cannot read it before it is detached and copied."""
 
     def __array__(self, *_: Any, **__: Any) -> Any:
         raise TypeError("can't convert cuda:0 device type tensor to numpy")
 
-    def detach(self) -> OnADevice:
+    def detach(self) -> DeviceTensor:
         self.is_detached = True
         return self
 
@@ -159,5 +159,5 @@ class OnADevice:
         return torch.ones(3)
 
 
-def test_what_is_on_a_device_is_copied() -> None:
-    np.testing.assert_array_equal(to_array("x", OnADevice()), np.ones(3))
+def test_tensors_on_a_device_are_copied_to_the_host() -> None:
+    np.testing.assert_array_equal(to_array("x", DeviceTensor()), np.ones(3))

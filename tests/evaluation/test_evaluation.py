@@ -19,15 +19,15 @@ from merl.evaluation.video import VideoWriter
 from toy import DotEnv
 
 
-def still(observation: Any) -> Any:
+def zero_action(observation: Any) -> Any:
     return np.zeros(1, np.float32)
 
 
-def test_every_evaluation_has_the_same_starts_whatever_came_before() -> None:
+def test_every_evaluation_has_the_same_starts() -> None:
     env = DotEnv()
-    first = evaluate(still, env, 5)
+    first = evaluate(zero_action, env, 5)
     env.reset(seed=3)
-    assert [e.total_reward for e in evaluate(still, env, 5).episodes] == [
+    assert [e.total_reward for e in evaluate(zero_action, env, 5).episodes] == [
         e.total_reward for e in first.episodes
     ]
     starts = []
@@ -39,9 +39,9 @@ def test_every_evaluation_has_the_same_starts_whatever_came_before() -> None:
     )
 
 
-def test_success_at_the_end_and_at_any_time_are_told_apart() -> None:
+def test_success_at_the_end_and_at_any_step_are_distinguished() -> None:
     def pass_by(observation: Any) -> Any:
-        """Through the middle, and out at the other end."""
+        """Move right through the goal to the end of the line."""
         return np.ones(1, np.float32)
 
     result = evaluate(pass_by, DotEnv(), 20)
@@ -62,36 +62,36 @@ def test_the_policy_is_reset_before_each_episode() -> None:
 
     def act(observation: Any) -> Any:
         calls.append("act")
-        return still(observation)
+        return zero_action(observation)
 
     evaluate(act, DotEnv(), 3, reset=lambda: calls.append("reset"))
     assert calls == (["reset"] + ["act"] * 10) * 3
 
 
-def test_the_first_episode_is_filmed_in_real_time(tmp_path: Path) -> None:
+def test_the_video_shows_the_first_episode_in_real_time(tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
-    evaluate(still, DotEnv(), 2, video=film)
+    evaluate(zero_action, DotEnv(), 2, video=film)
     with av.open(str(film)) as container:
         assert container.streams.video[0].average_rate == 25
         assert sum(1 for _ in container.decode(video=0)) == 10
 
 
-def test_a_video_that_cannot_be_made_does_not_cost_the_evaluation(
+def test_a_failed_video_does_not_end_the_evaluation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: Any, **__: Any) -> None:
         raise MerlError("film.mp4 cannot be written: No space left on device")
 
     monkeypatch.setattr(VideoWriter, "add", full)
-    plain = evaluate(still, DotEnv(), 3)
-    told: list[str] = []
-    result = evaluate(still, DotEnv(), 3, video=tmp_path / "film.mp4", warn=told.append)
+    plain = evaluate(zero_action, DotEnv(), 3)
+    messages: list[str] = []
+    result = evaluate(zero_action, DotEnv(), 3, video=tmp_path / "film.mp4", warn=messages.append)
     assert [e.total_reward for e in result.episodes] == [e.total_reward for e in plain.episodes]
-    (message,) = told
+    (message,) = messages
     assert "film.mp4 cannot be written: No space left on device" in message
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(MerlError):
-        evaluate(still, DotEnv(), 3, video=tmp_path / "film.mp4")
+        evaluate(zero_action, DotEnv(), 3, video=tmp_path / "film.mp4")
 
 
 @pytest.mark.parametrize(
@@ -111,23 +111,23 @@ def test_the_frame_rate_is_a_usable_positive_number_or_25(
     plain = DotEnv()
     plain.metadata = {"render_fps": fps}
     for repeat, env in ((1, plain), (2, ActionRepeat(plain, 2))):
-        told: list[str] = []
-        evaluate(still, env, 1, video=tmp_path / "film.mp4", warn=told.append)
+        messages: list[str] = []
+        evaluate(zero_action, env, 1, video=tmp_path / "film.mp4", warn=messages.append)
         with av.open(str(tmp_path / "film.mp4")) as container:
             shown = container.streams.video[0].average_rate
         assert shown == (25 if rate is None else rate / repeat)
-        assert sum("has no usable render_fps" in message for message in told) == (rate is None)
+        assert sum("has no usable render_fps" in message for message in messages) == (rate is None)
 
 
 @pytest.mark.parametrize("metadata", [None, [], "none", {}])
-def test_metadata_may_be_anything(tmp_path: Path, metadata: Any) -> None:
+def test_invalid_metadata_is_accepted(tmp_path: Path, metadata: Any) -> None:
     env = DotEnv()
     env.metadata = metadata
-    told: list[str] = []
+    messages: list[str] = []
     for each in (env, ActionRepeat(env, 2)):
-        evaluate(still, each, 1, video=tmp_path / "film.mp4", warn=told.append)
+        evaluate(zero_action, each, 1, video=tmp_path / "film.mp4", warn=messages.append)
         assert (tmp_path / "film.mp4").is_file()
-    assert len(told) == 2
+    assert len(messages) == 2
 
 
 @pytest.mark.parametrize(
@@ -138,12 +138,12 @@ def test_metadata_may_be_anything(tmp_path: Path, metadata: Any) -> None:
         [np.zeros((32, 32, 3), np.uint8)] * 2,
         np.zeros((32, 32), np.uint8),
         np.zeros((0, 0, 3), np.uint8),
-        "picture",
+        "text",
         OSError("the display is gone"),
     ],
     ids=str,
 )
-def test_frames_that_are_wrong_cost_the_video_alone(
+def test_invalid_frames_end_only_the_video(
     tmp_path: Path, frame: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def render(self: DotEnv) -> Any:
@@ -152,27 +152,27 @@ def test_frames_that_are_wrong_cost_the_video_alone(
         return frame if self.steps > 3 else np.zeros((32, 32, 3), np.uint8)
 
     monkeypatch.setattr(DotEnv, "render", render)
-    told: list[str] = []
-    result = evaluate(still, DotEnv(), 2, video=tmp_path / "film.mp4", warn=told.append)
+    messages: list[str] = []
+    result = evaluate(zero_action, DotEnv(), 2, video=tmp_path / "film.mp4", warn=messages.append)
     assert [episode.length for episode in result.episodes] == [10, 10]
-    assert len(told) == 1
+    assert len(messages) == 1
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(MerlError, match=r"film\.mp4 cannot be made"):
-        evaluate(still, DotEnv(), 2, video=tmp_path / "film.mp4")
+        evaluate(zero_action, DotEnv(), 2, video=tmp_path / "film.mp4")
 
 
-def test_an_episode_is_cut_at_the_limit() -> None:
-    told: list[str] = []
-    result = evaluate(still, DotEnv(), 3, warn=told.append, max_steps=4)
+def test_an_episode_is_truncated_at_the_limit() -> None:
+    messages: list[str] = []
+    result = evaluate(zero_action, DotEnv(), 3, warn=messages.append, max_steps=4)
     assert [episode.length for episode in result.episodes] == [4, 4, 4]
-    assert set(told) == {told[0]}
-    assert "cut after 4 steps" in told[0]
-    told.clear()
-    evaluate(still, DotEnv(), 3, warn=told.append, max_steps=10)
-    assert told == []
+    assert set(messages) == {messages[0]}
+    assert "cut after 4 steps" in messages[0]
+    messages.clear()
+    evaluate(zero_action, DotEnv(), 3, warn=messages.append, max_steps=10)
+    assert messages == []
 
 
-def test_random_generators_are_left_as_they_were_and_start_the_same_every_time() -> None:
+def test_evaluations_restore_random_generators_and_have_fixed_starts() -> None:
     class Global(DotEnv):
         def reset(self, **options: Any) -> Any:
             np.random.seed(options["seed"])  # noqa: NPY002
@@ -187,7 +187,7 @@ def test_random_generators_are_left_as_they_were_and_start_the_same_every_time()
     totals = []
     for _ in range(3):
         drawn += [draw(env) for draw in DRAWS]
-        totals.append([e.total_reward for e in evaluate(still, env, 3).episodes])
+        totals.append([e.total_reward for e in evaluate(zero_action, env, 3).episodes])
     env.reset(seed=0)
     seed_global_generators(0)
     expected = [draw(env) for _ in range(3) for draw in DRAWS]

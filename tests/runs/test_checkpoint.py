@@ -33,7 +33,7 @@ def agent(seed: int = 0, config: AgentConfig = CONFIG) -> DDPG:
     )
 
 
-def batch_of(of: DDPG) -> Batch:
+def make_batch() -> Batch:
     generator = torch.Generator().manual_seed(0)
     observation = {
         "image": torch.randint(0, 256, (4, 3, 16, 16, 3), dtype=torch.uint8, generator=generator),
@@ -43,8 +43,8 @@ def batch_of(of: DDPG) -> Batch:
     return Batch(observation, action, rest, rest, observation)
 
 
-def weights(of: DDPG) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in of.networks.parameters()])
+def weights(agent: DDPG) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in agent.networks.parameters()])
 
 
 @pytest.mark.parametrize(
@@ -58,10 +58,10 @@ def weights(of: DDPG) -> torch.Tensor:
     ],
     ids=lambda config: f"{type(config).__name__}-{config.fusion}-{config.latent_dim}",
 )
-def test_round_trip(tmp_path: Path, config: AgentConfig) -> None:
+def test_save_and_load_restores_the_agent(tmp_path: Path, config: AgentConfig) -> None:
     saved, other = agent(0, config), agent(1, config)
     for one in (saved, other):
-        one.update(batch_of(one))
+        one.update(make_batch())
     save(tmp_path, 250, saved, {"a": 1}, score=2.5, keep=2)
     found = Checkpoint.find(tmp_path)
     load_agent(other, found)
@@ -69,18 +69,18 @@ def test_round_trip(tmp_path: Path, config: AgentConfig) -> None:
     assert torch.equal(weights(saved), weights(other))
     assert torch.equal(saved.learning.get_state(), other.learning.get_state())
     for one in (saved, other):
-        one.update(batch_of(one))
+        one.update(make_batch())
     assert torch.equal(weights(saved), weights(other))
 
 
-def test_a_hundred_million_steps_come_after_ninety_nine(tmp_path: Path) -> None:
+def test_checkpoints_are_sorted_by_number_of_steps(tmp_path: Path) -> None:
     for step in (99_990_000, 99_995_000, 100_000_000):
         save(tmp_path, step, agent(), {}, score=None, keep=2)
     assert Checkpoint.find(tmp_path).step == 100_000_000
     assert not (tmp_path / "99990000").exists()
 
 
-def test_keeps_the_last_and_the_best(tmp_path: Path) -> None:
+def test_save_keeps_the_last_and_the_best(tmp_path: Path) -> None:
     for step, score in ((100, 1.0), (200, 9.0), (300, None), (400, 3.0), (500, None)):
         save(tmp_path, step, agent(), {}, score=score, keep=2)
     assert sorted(int(path.name) for path in tmp_path.iterdir()) == [200, 400, 500]
@@ -97,7 +97,7 @@ def test_a_second_save_at_a_step_replaces_the_first(tmp_path: Path) -> None:
     assert (found.score, found.state()) == (3.0, {"a": 2})
 
 
-def test_a_second_save_that_fails_at_the_last_moment_leaves_the_first(
+def test_a_second_save_that_fails_at_the_rename_keeps_the_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save(tmp_path, 100, agent(), {"a": 1}, score=None, keep=1)
@@ -114,7 +114,7 @@ def test_a_second_save_that_fails_at_the_last_moment_leaves_the_first(
     assert Checkpoint.find(tmp_path).state() == {"a": 1}
 
 
-def test_going_on_from_before_a_damaged_one_never_loses_the_good_ones(tmp_path: Path) -> None:
+def test_resuming_before_a_damaged_checkpoint_keeps_the_good_ones(tmp_path: Path) -> None:
     for step in (100, 300):
         save(tmp_path, step, agent(), {}, score=float(step), keep=2)
     (tmp_path / "00000300" / "learner.pt").write_bytes(b"")
@@ -126,7 +126,7 @@ def test_going_on_from_before_a_damaged_one_never_loses_the_good_ones(tmp_path: 
 
 
 def test_a_checkpoint_of_another_device_loads(tmp_path: Path) -> None:
-    """CUDA's generators have a state of 16 bytes; the noise then starts anew."""
+    """CUDA's generators have a state of 16 bytes; the noise then restarts from its seed."""
     saved, other, twin = agent(0), agent(1), agent(1)
 
     class OnCuda:
@@ -141,16 +141,16 @@ def test_a_checkpoint_of_another_device_loads(tmp_path: Path) -> None:
     assert torch.equal(other.acting.get_state(), twin.acting.get_state())
 
 
-def test_a_checkpoint_that_was_written_on_cuda_goes_on_here(tmp_path: Path) -> None:
-    """Its tensors are told to lie on cuda:0, and its Adam to be one for CUDA graphs."""
+def test_a_checkpoint_written_on_cuda_resumes_on_the_cpu(tmp_path: Path) -> None:
+    """The file claims that its tensors are on cuda:0 and that its Adam is for CUDA graphs."""
     saved, other = agent(0), agent(1)
-    saved.update(batch_of(saved))
+    saved.update(make_batch())
     for optimizer in (saved.critic_optimizer, saved.actor_optimizer):
         optimizer.param_groups[0]["capturable"] = True
     save(tmp_path, 1, saved, {}, score=None, keep=1)
     folder = tmp_path / "00000001"
     file = folder / "learner.pt"
-    tell_that_it_lies_on_cuda(file)
+    move_to_cuda(file)
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["files"][file.name] = _fingerprint(file)
     (folder / "manifest.json").write_text(json.dumps(manifest))
@@ -162,11 +162,11 @@ def test_a_checkpoint_that_was_written_on_cuda_goes_on_here(tmp_path: Path) -> N
         optimizer.param_groups[0]["capturable"] = False
     for learner in (saved, other):
         learner.learning.manual_seed(0)
-        learner.update(batch_of(learner))
+        learner.update(make_batch())
     assert torch.equal(weights(saved), weights(other))
 
 
-def tell_that_it_lies_on_cuda(file: Path) -> None:
+def move_to_cuda(file: Path) -> None:
     with zipfile.ZipFile(file) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(file, "w") as archive:
@@ -176,7 +176,7 @@ def tell_that_it_lies_on_cuda(file: Path) -> None:
 
 @pytest.mark.parametrize("name", ["weights.safetensors", "learner.pt", "state.json"])
 @pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "remove"])
-def test_a_damaged_file_is_passed_over(
+def test_a_damaged_checkpoint_is_skipped(
     tmp_path: Path, name: str, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     for step in (100, 200):
@@ -199,10 +199,10 @@ def test_a_damaged_file_is_passed_over(
         Checkpoint.find(tmp_path, "200")
 
 
-def test_none_at_all_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(MerlError, match="no whole checkpoint"):
+def test_a_missing_checkpoint_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MerlError, match="no complete checkpoint"):
         Checkpoint.find(tmp_path)
-    with pytest.raises(MerlError, match="not there"):
+    with pytest.raises(MerlError, match="does not exist"):
         Checkpoint.find(tmp_path, "300")
 
 
@@ -221,7 +221,7 @@ def test_other_networks_are_refused(tmp_path: Path) -> None:
         load_agent(wider, Checkpoint.find(tmp_path))
 
 
-def test_a_failed_save_leaves_the_former_one(
+def test_a_failed_save_keeps_the_former_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save(tmp_path, 100, agent(), {}, score=None, keep=1)
@@ -237,7 +237,7 @@ def test_a_failed_save_leaves_the_former_one(
 
 
 @pytest.mark.parametrize("content", ["[]", "3", "{", "[" * 100_000], ids=lambda text: text[:30])
-def test_a_state_of_another_form_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
+def test_an_invalid_state_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
     saved = save(tmp_path / "run", 1, agent(), {}, score=None, keep=1)
     (saved.path / "state.json").write_text(content)
     with pytest.raises(MerlError, match="cannot be loaded") as caught:
@@ -258,7 +258,7 @@ def test_a_state_of_another_form_is_refused_in_one_line(tmp_path: Path, content:
     ],
     ids=str,
 )
-def test_a_manifest_of_another_form_is_refused_in_one_line(
+def test_an_invalid_manifest_is_refused_in_one_line(
     tmp_path: Path, change: dict[str, object]
 ) -> None:
     saved = save(tmp_path / "run", 1, agent(), {}, score=None, keep=1)
@@ -269,13 +269,13 @@ def test_a_manifest_of_another_form_is_refused_in_one_line(
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_a_folder_that_only_looks_like_a_number_is_no_checkpoint(tmp_path: Path) -> None:
+def test_a_folder_named_with_a_superscript_digit_is_ignored(tmp_path: Path) -> None:
     save(tmp_path, 1, agent(), {}, score=None, keep=1)
     (tmp_path / "\N{SUPERSCRIPT TWO}").mkdir()
     assert Checkpoint.find(tmp_path).step == 1
 
 
-def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
+def test_a_pickle_is_refused_and_runs_no_code(tmp_path: Path) -> None:
     import pickle
 
     class Evil:
@@ -287,5 +287,5 @@ def test_a_pickle_that_would_run_code_is_refused(tmp_path: Path) -> None:
         (saved.path / "learner.pt").write_bytes(content)
         with pytest.raises(MerlError, match=r"cannot be loaded: learner\.pt holds") as caught:
             load_agent(agent(), saved)
-        assert "weights_only" not in str(caught.value)  # torch advises to switch it off
+        assert "weights_only" not in str(caught.value)  # torch recommends switching it off
     assert not (tmp_path / "owned").exists()

@@ -1,4 +1,4 @@
-"""Disks that are full, or not to be written to: small ones, mounted where nobody else sees them."""
+"""Full and read-only disks: small disks, mounted so that only the test process sees them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from merl.runs import checkpoint
 from merl.runs.checkpoint import Checkpoint
 
 SIZE = 24 * 2**20
-"""Of the disk, in bytes: a few checkpoints of the dot, its replay and its videos."""
-ALONE = ["unshare", "--map-root-user", "--mount"]
+"""Size of the disk in bytes: enough for a few checkpoints of the dot, its replay and its videos."""
+UNSHARE = ["unshare", "--map-root-user", "--mount"]
 
 
 def can_mount(folder: Path) -> bool:
-    mount = [*ALONE, "mount", "-t", "tmpfs", "tmpfs", str(folder)]
+    mount = [*UNSHARE, "mount", "-t", "tmpfs", "tmpfs", str(folder)]
     try:
         return subprocess.run(mount, capture_output=True, check=False).returncode == 0
     except FileNotFoundError:
@@ -38,21 +38,21 @@ def can_mount(folder: Path) -> bool:
 
 
 @pytest.mark.parametrize("which", ["full", "full_to_the_end", "read_only"])
-def test_a_disk(which: str, tmp_path: Path) -> None:
+def test_a_run_on_a_bad_disk(which: str, tmp_path: Path) -> None:
     if not can_mount(tmp_path):
-        pytest.skip("this system lets nobody mount a disk of their own")
-    alone = subprocess.run(
-        [*ALONE, sys.executable, __file__, which, str(tmp_path)],
+        pytest.skip("this system does not allow users to mount a disk")
+    done = subprocess.run(
+        [*UNSHARE, sys.executable, __file__, which, str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,
         timeout=900,
     )
-    assert alone.returncode == 0, alone.stdout + alone.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def read_only(folder: Path) -> None:
-    """Refused before anything is timed or built, and by name; what is there can be evaluated."""
+    """A read-only disk is refused at the start by name; a run on it can be evaluated."""
     mount(folder)
     assert main(line(folder / "run", "--steps", "100")) == 0
     mount(folder, "remount,ro")
@@ -67,7 +67,7 @@ def read_only(folder: Path) -> None:
 
 
 def fill(folder: Path) -> Path:
-    """Leave no byte."""
+    """Fill the disk completely and return the file that fills it."""
     filler = folder / "filler"
     with filler.open("ab", buffering=0) as file:
         for size in (2**20, 4096, 1):
@@ -85,7 +85,7 @@ def mount(folder: Path, options: str = f"size={SIZE}") -> None:
 
 
 def full(folder: Path) -> None:
-    """The run goes on, says what was not written, and has lost nothing once there is room."""
+    """The run continues, reports the failed save, and loses nothing once there is space."""
     mount(folder)
     run = folder / "run"
     often = ["--eval.every", "60", "--eval.video", "each"]
@@ -94,13 +94,13 @@ def full(folder: Path) -> None:
     wait_for(lambda: len(saved(run)) > 1, process)
     filler = fill(folder)
     before = saved(run)[-1]
-    told = []
-    for said in process.stdout:
-        told.append(said)
-        if "was not written" in said:
+    printed = []
+    for output_line in process.stdout:
+        printed.append(output_line)
+        if "was not written" in output_line:
             break
     times = psutil.Process(process.pid).cpu_times
-    worked = times().user  # it goes on, and keeps what it has to say
+    worked = times().user  # the run continues and keeps its metrics in memory
     wait_for(lambda: times().user > worked + 1.0, process)
     filler.unlink()
     wait_for(lambda: saved(run)[-1] > before, process)
@@ -115,11 +115,11 @@ def full(folder: Path) -> None:
     steps = read_metrics(run)["step"]
     assert (np.diff(steps) < 2 * EPISODE).all(), "a row is missing"  # one episode was cut off
     assert steps[0] == EPISODE
-    print("".join(told), out)
+    print("".join(printed), out)
 
 
 def full_to_the_end(folder: Path) -> None:
-    """The end is not saved, which the exit code tells; the run is resumed once there is room."""
+    """The end is not saved, so the exit code is 5; the run resumes once there is space."""
     mount(folder)
     run, output, steps = folder / "run", io.StringIO(), 240
     write = checkpoint.save
@@ -137,21 +137,21 @@ def full_to_the_end(folder: Path) -> None:
         str(steps),
         "--replay.capacity",
         "70",
-    ]  # which is overwritten meanwhile
+    ]  # small, so that old steps are overwritten
     with (
         mock.patch.object(checkpoint, "save", save_and_fill),
         contextlib.redirect_stdout(output),
         contextlib.redirect_stderr(output),
     ):
         code = main(line(run, *often))
-    told = output.getvalue()
-    assert code == 5, told
-    last = told.splitlines()[-1]
-    # The last page of metrics.csv may have room for some rows.
+    printed = output.getvalue()
+    assert code == 5, printed
+    last = printed.splitlines()[-1]
+    # The last page of metrics.csv may have space for some rows.
     lost = rf"ended at step {steps}, but its checkpoint( and \d+ rows of its metrics)? could not"
-    assert re.search(lost, last), told
+    assert re.search(lost, last), printed
     assert last.endswith(f"`merl resume {run}` continues from step {4 * EPISODE}")
-    assert "Traceback" not in told
+    assert "Traceback" not in printed
     assert saved(run) == [3 * EPISODE, 4 * EPISODE]
 
     (folder / "filler").unlink()
@@ -162,7 +162,7 @@ def full_to_the_end(folder: Path) -> None:
 
 
 def full_from_the_start(folder: Path) -> int:
-    """Where no checkpoint can be written nothing is begun, and nothing is left."""
+    """If no checkpoint can be written, no run starts and its folder is removed."""
     error = OSError(errno.ENOSPC, "No space left on device")
     with mock.patch.object(checkpoint, "save", side_effect=error):
         code = main(line(folder / "none"))

@@ -28,14 +28,14 @@ def scalars(run, name):
     return [(event.step, event.value) for event in accumulator.Scalars(name)]
 
 
-def test_a_row_per_step(tmp_path):
+def test_each_step_has_a_row(tmp_path):
     with MetricsWriter(tmp_path / "run") as writer:
         writer.write(250, {"train/return": 1.5})
         writer.write(500, {"train/return": np.float32(0.25)})
     assert rows(tmp_path / "run") == [["step", "train/return"], ["250", "1.5"], ["500", "0.25"]]
 
 
-def test_numbers_come_back_exactly(tmp_path):
+def test_values_are_read_back_exactly(tmp_path):
     value = 0.1 + 0.2
     with MetricsWriter(tmp_path) as writer:
         writer.write(1, {"a": value, "b": float("nan"), "c": 1e-300})
@@ -45,7 +45,7 @@ def test_numbers_come_back_exactly(tmp_path):
     assert back["c"][0] == 1e-300
 
 
-def test_a_column_may_come_later(tmp_path):
+def test_a_column_may_be_added_later(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
         writer.write(2, {"b, c": 2.0})
@@ -58,11 +58,13 @@ def test_a_column_may_come_later(tmp_path):
     ]
 
 
-def test_a_step_has_one_row(tmp_path):
+def test_writes_of_one_step_share_a_row(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         writer.write(0, {"a": 1.0, "b": 1.0})
         writer.write(1, {"a": 1.23456789, "b": 1.23456789})
-        writer.write(1, {"a": 2.0, "b": 2.0})  # shorter: nothing of the longer line may remain
+        writer.write(
+            1, {"a": 2.0, "b": 2.0}
+        )  # shorter than the line before, which must be removed completely
         assert rows(tmp_path)[1:] == [["0", "1.0", "1.0"], ["1", "2.0", "2.0"]]
         writer.write(1, {"c": 3.0})
         writer.write(2, {"a": 4.0})
@@ -75,7 +77,7 @@ def test_a_step_has_one_row(tmp_path):
     ]
 
 
-def test_a_row_is_on_disk_when_write_returns(tmp_path):
+def test_a_row_is_in_the_file_when_write_returns(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         for step in range(3):
             writer.write(step, {"a": 0.5})
@@ -83,7 +85,7 @@ def test_a_row_is_on_disk_when_write_returns(tmp_path):
             assert (tmp_path / "metrics.csv").read_bytes().endswith(b"\n")
 
 
-def test_refuses_a_step_back_and_names_that_are_no_columns(tmp_path):
+def test_write_refuses_earlier_steps_and_invalid_names(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         writer.write(10, {"a": 1.0})
         with pytest.raises(ValueError, match=r"trim\(9\)"):
@@ -96,7 +98,7 @@ def test_refuses_a_step_back_and_names_that_are_no_columns(tmp_path):
         writer.write(12, {"a": 1.0})
 
 
-def test_goes_on_where_it_stopped(tmp_path):
+def test_an_existing_file_is_continued(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
     with MetricsWriter(tmp_path) as writer:
@@ -107,14 +109,14 @@ def test_goes_on_where_it_stopped(tmp_path):
 
 
 @pytest.mark.parametrize("torn", ["3", "3,1.0", "\0\0\0\0"])
-def test_goes_on_after_a_torn_line(tmp_path, torn):
+def test_an_incomplete_last_line_is_removed(tmp_path, torn):
     (tmp_path / "metrics.csv").write_text("step,a\n1,1.0\n2,2.0\n" + torn)
     with MetricsWriter(tmp_path) as writer:
         writer.write(3, {"a": 3.5})
     assert rows(tmp_path)[1:] == [["1", "1.0"], ["2", "2.0"], ["3", "3.5"]]
 
 
-def test_survives_a_kill(tmp_path):
+def test_all_rows_are_kept_after_a_kill(tmp_path):
     code = (
         "import os, signal, sys\n"
         "from merl.runs.metrics import MetricsWriter\n"
@@ -127,7 +129,7 @@ def test_survives_a_kill(tmp_path):
     assert len(scalars(tmp_path, "a")) == 5
 
 
-def test_trim_leaves_no_step_twice(tmp_path):
+def test_trim_removes_later_steps(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         for step in (100, 200, 201, 300):
             writer.write(step, {"a": step})
@@ -152,7 +154,7 @@ def test_trim_to_before_the_first_row(tmp_path):
     assert rows(tmp_path) == [["step", "a"], ["50", "2.0"]]
 
 
-def test_tensorboard_shows_the_same(tmp_path):
+def test_tensorboard_has_the_same_values(tmp_path):
     with MetricsWriter(tmp_path) as writer:
         writer.write(1, {"train/return": 1.5, "eval/success": 0.5})
         writer.write(2, {"train/return": 2.5})
@@ -160,7 +162,7 @@ def test_tensorboard_shows_the_same(tmp_path):
     assert scalars(tmp_path, "eval/success") == [(1, 0.5)]
 
 
-def test_prints_nothing_and_leaves_tensorflow_alone(tmp_path):
+def test_prints_nothing_and_does_not_import_tensorflow(tmp_path):
     (tmp_path / "tensorflow.py").write_text("raise SystemExit('TensorFlow was imported')")
     code = (
         "import sys\n"
@@ -178,7 +180,7 @@ def test_prints_nothing_and_leaves_tensorflow_alone(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["a,b\n1,2\n", "step,a\n1\n", "step,a\n2,1\n1,1\n", "step\nx\n"])
-def test_never_overwrites_what_it_cannot_read(tmp_path, text):
+def test_an_unreadable_file_is_not_overwritten(tmp_path, text):
     path = tmp_path / "metrics.csv"
     path.write_text(text)
     with pytest.raises(MerlError, match=r"metrics\.csv"):
@@ -202,7 +204,7 @@ def test_an_interrupt_between_memory_and_file_loses_no_row(tmp_path, monkeypatch
 
 
 class FullDisk(io.FileIO):
-    """Takes a few bytes of what is written, then none, while `full`."""
+    """A file that accepts a few bytes and then none, while `full`."""
 
     full = False
 
@@ -231,18 +233,18 @@ def disk(monkeypatch):
 
 
 def test_a_full_disk_does_not_end_a_run(tmp_path, disk):
-    told = []
-    with MetricsWriter(tmp_path, warn=told.append) as writer:
+    warnings = []
+    with MetricsWriter(tmp_path, warn=warnings.append) as writer:
         writer.write(1, {"a": 1.0})
         disk.full = True
         writer.write(2, {"a": 2.0})
-        assert rows(tmp_path) == [["step", "a"], ["1", "1.0"]]  # and no piece of the second row
+        assert rows(tmp_path) == [["step", "a"], ["1", "1.0"]]  # no part of the second row
         writer.write(3, {"a": 3.0, "b": 3.0})
         writer.trim(2)
         writer.write(4, {"a": 4.0})
-        assert len(told) == 1
-        assert "No space left on device" in told[0]
-        assert "\n" not in told[0]
+        assert len(warnings) == 1
+        assert "No space left on device" in warnings[0]
+        assert "\n" not in warnings[0]
         disk.full = False
         writer.write(5, {"a": 5.0})
     assert rows(tmp_path) == [
@@ -253,20 +255,20 @@ def test_a_full_disk_does_not_end_a_run(tmp_path, disk):
         ["5", "5.0", ""],
     ]
     assert scalars(tmp_path, "a") == [(1, 1.0), (5, 5.0)]
-    assert len(told) == 1
+    assert len(warnings) == 1
 
 
-def test_a_disk_that_is_full_from_the_start_until_the_end(tmp_path, disk, caplog):
+def test_close_writes_the_rows_that_a_full_disk_has_refused(tmp_path, disk, caplog):
     disk.full = True
     with caplog.at_level(logging.WARNING), MetricsWriter(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
         disk.full = False
     assert len(caplog.records) == 1
-    assert rows(tmp_path) == [["step", "a"], ["1", "1.0"]]  # `close` has brought it there
+    assert rows(tmp_path) == [["step", "a"], ["1", "1.0"]]  # written by `close`
     assert [path.name for path in tmp_path.glob(".*")] == []
 
 
-def test_rows_that_are_not_on_the_disk_are_counted(tmp_path, disk):
+def test_unwritten_counts_the_rows_that_are_not_in_the_file(tmp_path, disk):
     with MetricsWriter(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
         assert writer.unwritten == 0

@@ -1,4 +1,4 @@
-"""Runs recorded by earlier versions of merl, whose configs name what no longer exists."""
+"""Runs of earlier versions of merl, whose configs name values that no longer exist."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from merl.runs.run import Run
 IMAGE = spaces.Box(0, 255, (32, 32, 3), np.uint8)
 VECTOR = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 ACTION = spaces.Box(-1.0, 1.0, (9,), np.float32)
-SENSES = spaces.Dict({"image": IMAGE, "proprio": VECTOR})
+CAMERA = spaces.Dict({"image": IMAGE, "proprio": VECTOR})
 STATE = spaces.Dict({"state": VECTOR})
 
 
 @pytest.fixture
 def recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Record a run whose environment is changed; returns its folder."""
+    """Return a function that records a run with a changed environment config."""
     for name in ("commit", "machine", "package_versions"):
         monkeypatch.setattr(f"merl.runs.run.{name}", dict)
 
-    def record(task: str, senses: spaces.Dict, folder: str = "run", **env: Any) -> Path:
-        agent = "merl_state" if senses is STATE else "merl"
+    def record(task: str, space: spaces.Dict, folder: str = "run", **env: Any) -> Path:
+        agent = "merl_state" if space is STATE else "merl"
         config = dataclasses.replace(compose("smoke", task, agent), run_dir=tmp_path / folder)
-        with Run.begin(config, senses, ACTION):
+        with Run.begin(config, space, ACTION):
             pass
         file = tmp_path / folder / CONFIG_FILE
         plain = json.loads(file.read_text())
@@ -45,7 +45,7 @@ def recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def test_a_run_that_saw_images_of_a_removed_renderer_is_refused(recorded: Any) -> None:
     with pytest.raises(MerlError, match=r"renderer 'warp' no longer exists: .*raster") as error:
-        Run.open(recorded("reach_duplo", SENSES, renderer="warp"))
+        Run.open(recorded("reach_duplo", CAMERA, renderer="warp"))
     assert "\n" not in str(error.value)
 
 
@@ -61,30 +61,30 @@ def test_a_run_of_a_removed_form_of_a_task_is_refused(
     assert "\n" not in str(error.value)
 
 
-def test_a_run_on_the_floor_that_is_left_is_opened(recorded: Any) -> None:
-    folder = recorded("move_box", SENSES, floor="rough", reward="staged")
+def test_a_run_on_the_remaining_floor_is_opened(recorded: Any) -> None:
+    folder = recorded("move_box", CAMERA, floor="rough", reward="staged")
     run = Run.open(folder)
     assert run.config.env == dataclasses.replace(compose("smoke", "move_box").env, reward="staged")
     with pytest.raises(MerlError, match="floor 'wet' is unknown"):
-        Run.open(recorded("lift_box", SENSES, folder="other", floor="wet"))
+        Run.open(recorded("lift_box", CAMERA, folder="other", floor="wet"))
 
 
 @pytest.mark.parametrize(
-    ("task", "senses"), [("move_box", STATE), ("Pendulum-v1", STATE), ("Pendulum-v1", SENSES)]
+    ("task", "space"), [("move_box", STATE), ("Pendulum-v1", STATE), ("Pendulum-v1", CAMERA)]
 )
-def test_a_removed_renderer_that_drew_nothing_for_the_agent_is_replaced(
-    recorded: Any, task: str, senses: spaces.Dict
+def test_a_removed_renderer_is_replaced_if_the_agent_used_no_image_of_it(
+    recorded: Any, task: str, space: spaces.Dict
 ) -> None:
-    run = Run.open(recorded(task, senses, renderer="warp"))
+    run = Run.open(recorded(task, space, renderer="warp"))
     assert run.config.env.renderer == "raster"
     config, changes = merge_resume_config(run.config, run.config)
     assert (config.env, changes) == (run.config.env, [])
 
 
-def test_a_users_environment_resumes_whatever_the_preset_says_of_merls_own_tasks(
+def test_a_users_environment_resumes_with_any_env_config_of_merls_own_tasks(
     recorded: Any,
 ) -> None:
-    run = Run.open(recorded("Pendulum-v1", SENSES, image_size=48, renderer="gl"))
+    run = Run.open(recorded("Pendulum-v1", CAMERA, image_size=48, renderer="gl"))
     asked = dataclasses.replace(compose("smoke", "Pendulum-v1"), run_dir=run.path)
     assert asked.env != run.config.env
     assert merge_resume_config(run.config, asked) == (run.config, [])

@@ -1,4 +1,4 @@
-"""What kills a run, and that it goes on: processes of their own, on a task that takes seconds."""
+"""Runs that are killed and resume: separate processes, on a task that takes seconds."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from merl.report.curves import read_metrics
 
 MERL = [sys.executable, "-m", "merl.cli"]
 EPISODE = 20
-"""Steps of an episode of the dot."""
+"""Steps of an episode of the dot environment."""
 STEPS = 600
 
 
 def line(folder: Path, *more: str) -> list[str]:
-    """The dot, saved at every episode's end."""
+    """Return a command that trains the dot and saves at the end of every episode."""
     small = {
         "--preset": "smoke",
         "--threads": 1,
@@ -65,7 +65,7 @@ def start(arguments: list[str]) -> subprocess.Popen[str]:
 
 @contextmanager
 def started(arguments: list[str]) -> Iterator[subprocess.Popen[str]]:
-    """A process that does not outlive the test."""
+    """Start a process that ends with the test at the latest."""
     process = start(arguments)
     try:
         yield process
@@ -75,7 +75,7 @@ def started(arguments: list[str]) -> Iterator[subprocess.Popen[str]]:
 
 
 def assert_same(one: Path, other: Path) -> None:
-    """The same weights, replay and metrics, bit for bit, time columns aside."""
+    """Check that weights, replay and metrics are equal, bit for bit, except columns of times."""
     assert saved(one)[-1] == saved(other)[-1]
     weights = [load_file(run / f"checkpoints/{saved(run)[-1]:08d}/weights.safetensors")
                for run in (one, other)]  # fmt: skip
@@ -92,22 +92,22 @@ def assert_same(one: Path, other: Path) -> None:
             np.testing.assert_array_equal(values, metrics[1][name], err_msg=name)
 
 
-def killed_and_gone_on_with(
+def check_killed_run_resumes_exactly(
     tmp_path: Path, kills: int, more: tuple[str, ...] = (), at: int = 0
 ) -> None:
-    """Compare a whole run with one that is killed so often, the first time beyond step `at`."""
+    """Compare a complete run with one that is killed `kills` times, first after step `at`."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert main(line(whole, *more)) == 0
-    moment = random.Random(kills)
+    delay = random.Random(kills)
     done, first = at, line(parts, *more)
     while kills:
         with started(first if not saved(parts) else ["resume", str(parts)]) as process:
             wait_until_saved(parts, process, done)
-            time.sleep(moment.uniform(0.0, 0.3))
+            time.sleep(delay.uniform(0.0, 0.3))
         reached, before = int(read_metrics(parts)["step"][-1]), done
         done = saved(parts)[-1]
         assert done > before
-        assert reached - done <= EPISODE, "more than one checkpoint's interval is lost"
+        assert reached - done <= EPISODE, "more than one checkpoint interval is lost"
         kills -= 1
         if done == STEPS:
             break
@@ -115,47 +115,49 @@ def killed_and_gone_on_with(
     assert_same(whole, parts)
 
 
-def test_killed_at_any_moment_it_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
-    killed_and_gone_on_with(tmp_path, 2)
+def test_a_killed_run_resumes_bit_exactly(tmp_path: Path) -> None:
+    check_killed_run_resumes_exactly(tmp_path, 2)
 
 
 @pytest.mark.parametrize("more", [(), ("--replay.compress",)])
-def test_so_it_does_where_the_ring_has_wrapped(tmp_path: Path, more: tuple[str, ...]) -> None:
-    killed_and_gone_on_with(tmp_path, 1, ("--replay.capacity", "200", *more), at=240)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("more", [(), ("--replay.compress",)])
-def test_so_it_does_where_the_ring_wraps_between_kills(
+def test_a_killed_run_resumes_bit_exactly_after_the_ring_has_wrapped(
     tmp_path: Path, more: tuple[str, ...]
 ) -> None:
-    killed_and_gone_on_with(tmp_path, 4, ("--replay.capacity", "200", *more))
+    check_killed_run_resumes_exactly(tmp_path, 1, ("--replay.capacity", "200", *more), at=240)
 
 
 @pytest.mark.long
-def test_killed_twenty_times_it_goes_on(tmp_path: Path) -> None:
-    killed_and_gone_on_with(tmp_path, 20, ("--steps", "4000"))
+@pytest.mark.parametrize("more", [(), ("--replay.compress",)])
+def test_a_killed_run_resumes_bit_exactly_while_the_ring_wraps(
+    tmp_path: Path, more: tuple[str, ...]
+) -> None:
+    check_killed_run_resumes_exactly(tmp_path, 4, ("--replay.capacity", "200", *more))
+
+
+@pytest.mark.long
+def test_a_run_killed_twenty_times_resumes_bit_exactly(tmp_path: Path) -> None:
+    check_killed_run_resumes_exactly(tmp_path, 20, ("--steps", "4000"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGUSR1])
-def test_a_signal_saves_in_the_midst_of_whatever_it_does(tmp_path: Path, number: int) -> None:
-    signalled(tmp_path, [number])
+def test_a_signal_saves_during_any_work(tmp_path: Path, number: int) -> None:
+    check_signals_save(tmp_path, [number])
 
 
 @pytest.mark.long
-def test_signals_save_in_the_midst_of_whatever_it_does(tmp_path: Path) -> None:
-    signalled(tmp_path, [signal.SIGTERM, signal.SIGUSR1, signal.SIGINT] * 4)
+def test_many_signals_save_during_any_work(tmp_path: Path) -> None:
+    check_signals_save(tmp_path, [signal.SIGTERM, signal.SIGUSR1, signal.SIGINT] * 4)
 
 
-def signalled(tmp_path: Path, numbers: list[int]) -> None:
-    """Evaluations and videos all the time, so that the signals meet acting, learning, and these."""
-    folder, moment = tmp_path / "run", random.Random(len(numbers))
+def check_signals_save(tmp_path: Path, numbers: list[int]) -> None:
+    """Signal a run that acts, learns, and often evaluates and makes videos."""
+    folder, delay = tmp_path / "run", random.Random(len(numbers))
     often = ["--eval.every", "20", "--eval.video", "each", "--steps", "100000"]
     for number in numbers:
         done = saved(folder)[-1] if saved(folder) else 0
         with started(["resume", str(folder)] if done else line(folder, *often)) as process:
             wait_until_saved(folder, process, done)
-            time.sleep(moment.uniform(0.0, 1.0))
+            time.sleep(delay.uniform(0.0, 1.0))
             process.send_signal(number)
             out, err = process.communicate()
         assert process.returncode == 128 + number, err
@@ -166,7 +168,7 @@ def signalled(tmp_path: Path, numbers: list[int]) -> None:
     assert (np.diff(steps) > 0).all()
 
 
-def test_a_folder_that_is_taken_away_is_not_made_anew(tmp_path: Path) -> None:
+def test_a_folder_that_is_moved_away_is_not_created_again(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with started(line(folder, "--steps", "100000")) as process:
         wait_until_saved(folder, process)
@@ -180,7 +182,7 @@ def test_a_folder_that_is_taken_away_is_not_made_anew(tmp_path: Path) -> None:
     assert main(["resume", str(tmp_path / "elsewhere"), "--steps", further]) == 0
 
 
-def test_the_same_line_begins_goes_on_and_is_done(
+def test_one_command_starts_resumes_and_completes_a_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, short = tmp_path / "run", ["--resume", "--steps", "200"]
@@ -189,47 +191,49 @@ def test_the_same_line_begins_goes_on_and_is_done(
     assert "is done: 200 of 200 steps" in capsys.readouterr().out
 
     assert main(line(folder, "--resume", "--steps", "300", "--eval.episodes", "1")) == 0
-    told = flat(capsys.readouterr().out)
-    assert "goes on at step 200 with steps 200 -> 300, eval.episodes 2 -> 1:" in told
+    out = flat(capsys.readouterr().out)
+    assert "resumes at step 200 with steps 200 -> 300, eval.episodes 2 -> 1:" in out
 
     before = (folder / "config.json").read_bytes()
     assert main(line(folder, "--resume", "--seed", "1", "--agent.latent-dim", "64")) == 2
-    told = capsys.readouterr().err
-    assert "seed 0 -> 1" in told
-    assert "agent.latent_dim 128 -> 64" in told
+    err = capsys.readouterr().err
+    assert "seed 0 -> 1" in err
+    assert "agent.latent_dim 128 -> 64" in err
     assert (folder / "config.json").read_bytes() == before
 
     assert main(line(folder, "--steps", "400")) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     shutil.rmtree(folder / "checkpoints")
     assert main(line(folder, "--resume", "--steps", "400")) == 2
-    assert "no whole checkpoint" in capsys.readouterr().err
+    assert "no complete checkpoint" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("how", ["train", "resume"])
-def test_a_run_that_was_killed_before_its_first_checkpoint_begins(tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize("command", ["train", "resume"])
+def test_a_run_killed_before_its_first_checkpoint_starts_again(
+    tmp_path: Path, command: str
+) -> None:
     folder = tmp_path / "run"
     assert main(line(folder, "--steps", "100")) == 0
     shutil.rmtree(folder / "checkpoints")
     (folder / "metrics.csv").write_text("step\n")
     assert main(["resume", str(folder)]) == 2  # there are steps in its replay
-    assert (folder / "replay" / "moment.bin").is_file()
-    # What a kill leaves behind before the first checkpoint: a replay of nothing.
-    (folder / "replay" / "moment.bin").write_bytes(bytes(8 * 200))
+    assert (folder / "replay" / "timestep.bin").is_file()
+    # State after a kill before the first checkpoint: an empty replay.
+    (folder / "replay" / "timestep.bin").write_bytes(bytes(8 * 200))
     (folder / "checkpoints" / ".part-00000000").mkdir(parents=True)
-    on = line(folder, "--resume", "--steps", "200") if how == "train" else ["resume", str(folder)]
-    assert main(on) == 0
+    train = line(folder, "--resume", "--steps", "200")
+    assert main(train if command == "train" else ["resume", str(folder)]) == 0
     steps = read_metrics(folder)["step"]
     assert steps[0] == EPISODE
-    assert steps[-1] == saved(folder)[-1] == (200 if how == "train" else 100)
+    assert steps[-1] == saved(folder)[-1] == (200 if command == "train" else 100)
     assert main(["resume", str(folder), "--steps", "220"]) == 0
 
 
 @pytest.mark.long
 def test_a_soak_for_three_minutes(tmp_path: Path) -> None:
-    """`benchmarks/measure_soak.py` goes on for two hours."""
+    """Run `benchmarks/measure_soak.py`, which takes two hours by default."""
     without_end = ["--steps", "100000000", "--updates-per-step", "0.1"]
-    flags = [*line(tmp_path)[2:-4], *without_end]  # the script says --run-dir
+    flags = [*line(tmp_path)[2:-4], *without_end]  # the script adds --run-dir
     script = Path(__file__).parents[2] / "benchmarks" / "measure_soak.py"
     rows = tmp_path / "soak.csv"
     command = [sys.executable, script, "--minutes", "3", "--least", "40", "--most", "60"]

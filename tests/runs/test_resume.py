@@ -14,14 +14,14 @@ RECORDED = dataclasses.replace(
 )
 
 
-def test_what_is_left_open_stays_as_the_run_decided() -> None:
+def test_open_fields_keep_their_recorded_values() -> None:
     asked = dataclasses.replace(RECORDED, threads=None, device="auto", minutes=None)
     config, changes = merge_resume_config(RECORDED, asked)
     assert config == dataclasses.replace(RECORDED, minutes=None)
     assert changes == []
 
 
-def test_harmless_changes_are_taken_and_told() -> None:
+def test_harmless_changes_are_applied_and_listed() -> None:
     asked = dataclasses.replace(
         RECORDED,
         steps=2000,
@@ -57,8 +57,8 @@ def test_harmless_changes_are_taken_and_told() -> None:
         ),
     ],
 )
-def test_what_makes_it_another_run_is_refused_by_name(asked, named) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(MerlError, match="run runs/mine cannot go on with") as caught:
+def test_resume_refuses_other_changes_and_names_them(asked, named) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(MerlError, match="run runs/mine cannot resume with") as caught:
         merge_resume_config(RECORDED, asked)
     for words in named:
         assert words in str(caught.value)

@@ -1,4 +1,4 @@
-"""How a run's folder is begun: by one process, whatever was left in it, and by which lines."""
+"""The start of a run in its folder: locking, leftover files, and config changes on resume."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def together(*actions: Any) -> list[BaseException | None]:
-    """Do all at the same moment, in threads; returns what each has raised."""
+    """Run all actions at the same time in threads; return the exception of each, or None."""
     barrier, errors = threading.Barrier(len(actions)), [None] * len(actions)
 
     def do(index: int) -> None:
@@ -54,15 +54,15 @@ def together(*actions: Any) -> list[BaseException | None]:
 
 @pytest.mark.usefixtures("_quick")
 @pytest.mark.parametrize("fails", [False, True])
-def test_of_many_that_begin_one_run_one_does(tmp_path: Path, fails: bool) -> None:
-    """Those that fail after they had the lock remove their own folder, never that of the next."""
+def test_only_one_of_several_processes_starts_a_run(tmp_path: Path, fails: bool) -> None:
+    """A start that fails while it holds the lock removes only its own folder."""
     for attempt in range(40):
         config = dataclasses.replace(CONFIG, run_dir=tmp_path / f"run-{attempt}")
         alone = threading.Lock()
 
         def begin(config: TrainConfig = config, alone: Any = alone) -> None:
             with Run.begin(config, *SPACES) as run:
-                assert alone.acquire(blocking=False), "two are in the folder"
+                assert alone.acquire(blocking=False), "two threads have the lock"
                 assert json.loads((run.path / CONFIG_FILE).read_text())["task"] == "reach_duplo"
                 if fails:
                     run.discard()
@@ -79,7 +79,7 @@ def test_of_many_that_begin_one_run_one_does(tmp_path: Path, fails: bool) -> Non
 
 
 @pytest.mark.usefixtures("_quick")
-def test_runs_without_a_name_of_their_own_take_different_ones(
+def test_runs_without_a_given_folder_get_different_folders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -93,7 +93,7 @@ def test_runs_without_a_name_of_their_own_take_different_ones(
 
 
 @pytest.mark.usefixtures("_quick")
-def test_a_folder_that_another_process_has_locked_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_locked_by_another_process_is_refused(tmp_path: Path) -> None:
     (tmp_path / LOCK_FILE).write_text("42")
     config = dataclasses.replace(CONFIG, run_dir=tmp_path)
     with (tmp_path / LOCK_FILE).open() as file:
@@ -107,7 +107,7 @@ def test_a_folder_that_another_process_has_locked_is_left_alone(tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("_quick")
-def test_what_others_have_put_into_a_folder_stays(tmp_path: Path) -> None:
+def test_discard_keeps_other_files_and_an_existing_folder(tmp_path: Path) -> None:
     config = dataclasses.replace(CONFIG, run_dir=tmp_path / "run")
     with Run.begin(config, *SPACES) as run:
         (run.path / "notes.txt").write_text("precious")
@@ -121,7 +121,7 @@ def test_what_others_have_put_into_a_folder_stays(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("_quick")
 @pytest.mark.parametrize("name", ["commit", "trust.remember"])
-def test_a_start_that_is_interrupted_leaves_nothing(
+def test_an_interrupted_start_leaves_no_files(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: object) -> None:
@@ -136,7 +136,7 @@ def test_a_start_that_is_interrupted_leaves_nothing(
 
 @pytest.mark.parametrize("left", [(), (LOCK_FILE,), (LOCK_FILE, ".config.json.part")])
 @pytest.mark.parametrize("resume", [["--resume"], []])
-def test_a_run_that_was_killed_at_its_very_start_is_begun_by_the_same_line(
+def test_a_run_killed_before_its_config_is_started_by_the_same_command(
     tmp_path: Path, left: tuple[str, ...], resume: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "run"
@@ -145,7 +145,7 @@ def test_a_run_that_was_killed_at_its_very_start_is_begun_by_the_same_line(
         (folder / name).write_text("12")
     assert main(["resume", str(folder)]) == 2
     error = capsys.readouterr().err
-    assert "is not a run: it has no config.json, and nothing else: begin it with" in error
+    assert "is not a run: it has no config.json and no other files: start it with" in error
     assert f"train ... --run-dir {folder}\n" in error
     assert error.count("\n") == 1
     assert main([*PENDULUM.split(), str(folder), "--threads", "1", *resume]) == 0
@@ -153,18 +153,18 @@ def test_a_run_that_was_killed_at_its_very_start_is_begun_by_the_same_line(
 
 
 @pytest.mark.parametrize("foreign", ["notes.txt", ".hidden", "checkpoints"])
-def test_a_folder_with_other_files_is_not_begun_in(
+def test_a_folder_with_other_files_is_refused(
     tmp_path: Path, foreign: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / foreign).write_text("precious")
     assert main([*PENDULUM.split(), str(tmp_path), "--resume"]) == 2
-    assert "exists already: it is not a run" in capsys.readouterr().err
+    assert "already exists: it is not a run" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == [foreign]
 
 
 @pytest.fixture(scope="module")
-def begun(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A run whose line left threads and precision open, and one whose line gave them."""
+def trained_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Train a run that left threads and precision open, and one with given values."""
     folder = tmp_path_factory.mktemp("runs")
     given = ["--threads", "1", "--agent.precision", "bf16"]
     for name, flags in {"open": [], "given": given}.items():
@@ -190,8 +190,8 @@ BF16 = ("--threads", "1", "--agent.precision", "bf16")
         ("given", False, ["train", "--agent.precision=auto", "--threads", "None"], None, "auto"),
     ],
 )
-def test_what_the_line_asks_for_is_taken_on_another_machine_too(
-    begun: dict[str, Path],
+def test_options_of_the_command_are_used_on_this_and_another_machine(
+    trained_runs: dict[str, Path],
     run: str,
     moved: bool,
     line: list[str],
@@ -202,7 +202,7 @@ def test_what_the_line_asks_for_is_taken_on_another_machine_too(
     trained: list[TrainConfig] = []
     monkeypatch.setattr("merl.cli.running._train", lambda config, *_: trained.append(config) or 0)
     monkeypatch.setattr(Run, "has_moved", lambda _: moved)
-    folder, (command, *flags) = str(begun[run]), line
+    folder, (command, *flags) = str(trained_runs[run]), line
     if command == "resume":
         arguments = ["resume", folder, "--steps", "30"]
     else:
@@ -212,12 +212,12 @@ def test_what_the_line_asks_for_is_taken_on_another_machine_too(
     assert (config.threads, config.agent.precision) == (threads, precision)
 
 
-def test_a_device_that_is_not_here_gives_way_where_auto_is_asked_for(
-    begun: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_device_auto_replaces_a_recorded_device_that_is_missing(
+    trained_runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The run's last device was a GPU."""
+    """The run was last trained on a GPU."""
     folder = tmp_path / "run"
-    shutil.copytree(begun["given"], folder)
+    shutil.copytree(trained_runs["given"], folder)
     record = json.loads((folder / "config.json").read_text())
     record["config"]["device"] = "cuda"
     (folder / "config.json").write_text(json.dumps(record))
@@ -235,7 +235,7 @@ def test_a_loop_of_links_is_refused_in_one_line(tmp_path: Path) -> None:
         check_links(tmp_path)
 
 
-def test_a_config_that_is_nested_too_deeply_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_config_with_too_deep_nesting_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text("[" * 100_000)
     with pytest.raises(MerlError, match="cannot be read"):
         Run.open(tmp_path)

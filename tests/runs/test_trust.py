@@ -1,4 +1,4 @@
-"""A run folder from a stranger: opening, evaluating and resuming it imports nothing of it."""
+"""Untrusted run folders: opening, evaluating and resuming one imports no code of it."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ SMALL = [str(part) for flag in _FLAGS.items() for part in flag] + ["--eval.no-re
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A run of this user's, of an environment in the folder where it was trained."""
+    """Train a run as this user, with an environment in the current folder."""
     folder = tmp_path_factory.mktemp("mine")
     (folder / "toy_arm.py").write_text(TOY)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         before = list(sys.path)
         assert main(["train", "toy_arm:make", *SMALL, "--run-dir", "run"]) == 0
-        assert sys.path == [*before, str(folder)]  # it is only appended to
+        assert sys.path == [*before, str(folder)]  # the folder is appended
     yield folder / "run"
     sys.path.remove(str(folder))
 
@@ -88,9 +88,9 @@ def _fresh_modules() -> Iterator[None]:
 
 
 @pytest.fixture
-def stranger(trained: Path, tmp_path: Path) -> Path:
-    """A copy of the run with hostile modules in it, each of which leaves a mark when imported."""
-    folder = tmp_path / "stranger"
+def untrusted(trained: Path, tmp_path: Path) -> Path:
+    """Copy the run and add hostile modules that write a file when they are imported."""
+    folder = tmp_path / "untrusted"
     shutil.copytree(trained, folder)
     for name in ("evil", "toy_arm"):
         plant(folder / f"{name}.py")
@@ -98,7 +98,7 @@ def stranger(trained: Path, tmp_path: Path) -> Path:
 
 
 def plant(path: Path) -> None:
-    """A module that does what it should, and writes `imported` beside itself."""
+    """Write a module with the environment, which also writes `imported` beside itself."""
     path.parent.mkdir(parents=True, exist_ok=True)
     mark = f"open({str(path.parent / 'imported')!r}, 'a').write({path.name!r})\n"
     path.write_text(mark + TOY)
@@ -130,44 +130,44 @@ COMMANDS = (["evaluate", "--episodes", "1"], ["resume"])
     ],
 )
 def test_code_that_a_run_names_is_not_imported(
-    stranger: Path,
+    untrusted: Path,
     attack: Callable[[Path], None],
     named: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    attack(stranger)
-    monkeypatch.chdir(stranger)
+    attack(untrusted)
+    monkeypatch.chdir(untrusted)
     for command, *more in COMMANDS:
         assert main([command, ".", *more]) == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1
-        assert named.format(run=stranger) in error
+        assert named.format(run=untrusted) in error
         assert "add --trust" in error
-    policy = merl.load_policy(stranger)  # runs no code
+    policy = merl.load_policy(untrusted)  # runs no code
     with pytest.raises(MerlError, match="names code as its environment"):
         policy.make_env()
-    assert not (stranger / "imported").exists()
+    assert not (untrusted / "imported").exists()
 
 
-def test_a_run_that_was_trained_here_imports_what_it_was_trained_with(
-    stranger: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_trained_here_imports_its_recorded_module(
+    untrusted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither the folder that its config names nor the working folder is believed."""
-    edit(stranger, lambda record: record.update(module_folder=str(stranger)))
-    monkeypatch.chdir(stranger)
+    """The folder in its config and the working folder are not trusted."""
+    edit(untrusted, lambda record: record.update(module_folder=str(untrusted)))
+    monkeypatch.chdir(untrusted)
     for command, *more in COMMANDS:
         assert main([command, ".", *more]) == 0
-    merl.load_policy(stranger).make_env().close()
-    assert not (stranger / "imported").exists()
+    merl.load_policy(untrusted).make_env().close()
+    assert not (untrusted / "imported").exists()
 
 
-def test_a_registered_environment_of_others_is_code(stranger: Path) -> None:
+def test_an_environment_registered_by_others_counts_as_code(untrusted: Path) -> None:
     gymnasium.register("Evil-v0", entry_point="evil:make")
     try:
-        set_task(stranger, "Evil-v0")
+        set_task(untrusted, "Evil-v0")
         with pytest.raises(MerlError, match="Gymnasium environment 'Evil-v0'"):
-            Run.open(stranger).load_module()
+            Run.open(untrusted).load_module()
         assert imports_code("Evil-v0")
     finally:
         gymnasium.registry.pop("Evil-v0")
@@ -177,42 +177,42 @@ def test_a_registered_environment_of_others_is_code(stranger: Path) -> None:
         assert imports_code(task)
 
 
-def test_trust_on_the_line_is_told_and_lasts_once_the_run_is_resumed(
-    stranger: Path,
+def test_the_trust_flag_is_reported_and_recorded_on_resume(
+    untrusted: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of another user"))
     monkeypatch.chdir(tmp_path)
-    edit(stranger, lambda record: record.update(module_folder=str(stranger)))
-    run = str(stranger)
+    edit(untrusted, lambda record: record.update(module_folder=str(untrusted)))
+    run = str(untrusted)
     assert main(["evaluate", run, "--episodes", "1"]) == 2
     capsys.readouterr()
     assert main(["evaluate", run, "--episodes", "1", "--trust"]) == 0
     importing = f"importing 'make' of module 'toy_arm', in folder {run!r}\n"
     assert capsys.readouterr().err == f"merl: --trust: {importing}"
-    assert (stranger / "imported").read_text() == "toy_arm.py"
-    merl.load_policy(stranger).make_env(trust=True).close()
-    assert main(["resume", run, "--steps", "40"]) == 2  # that it was evaluated trains nothing
+    assert (untrusted / "imported").read_text() == "toy_arm.py"
+    merl.load_policy(untrusted).make_env(trust=True).close()
+    assert main(["resume", run, "--steps", "40"]) == 2  # an evaluation is not recorded as training
     assert main(["resume", run, "--steps", "40", "--trust"]) == 0
     assert main(["evaluate", run, "--episodes", "1"]) == 0
 
 
-def test_the_line_that_began_a_run_names_its_code(
-    stranger: Path, trained: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_train_with_resume_trusts_the_module_of_the_command(
+    untrusted: Path, trained: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """`train --resume` imports the module that the user names from where the user is."""
+    """`train --resume` imports the named module from the working folder of the user."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of another user"))
-    edit(stranger, lambda record: record.update(module_folder=str(stranger)))
+    edit(untrusted, lambda record: record.update(module_folder=str(untrusted)))
     monkeypatch.chdir(trained.parent)
-    line = ["train", "toy_arm:make", *SMALL, "--run-dir", str(stranger), "--resume"]
+    line = ["train", "toy_arm:make", *SMALL, "--run-dir", str(untrusted), "--resume"]
     assert main(line) == 0
-    assert not (stranger / "imported").exists()
+    assert not (untrusted / "imported").exists()
 
 
-def test_a_module_is_loaded_by_its_place_and_replaces_none(tmp_path: Path) -> None:
-    """A file has the name of a module of Python's, which is not loaded, or is."""
+def test_a_module_is_loaded_from_its_folder_and_replaces_no_other(tmp_path: Path) -> None:
+    """Files have the names of modules of Python: one that is loaded, and one that is not."""
     sys.modules.pop("colorsys", None)
     for name in ("colorsys", "json"):
         (tmp_path / f"{name}.py").write_text(TOY)
@@ -225,7 +225,7 @@ def test_a_module_is_loaded_by_its_place_and_replaces_none(tmp_path: Path) -> No
     assert sys.modules["json"] is json
 
 
-def test_where_no_record_can_be_kept_nothing_is_trusted(
+def test_nothing_is_trusted_if_no_record_can_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     identity, origin = trust.identity(), Origin("evil:make", None)
@@ -236,7 +236,7 @@ def test_where_no_record_can_be_kept_nothing_is_trusted(
     assert "--trust will be needed" in caplog.text
     with pytest.raises(MerlError, match="records of runs cannot be read"):
         trust.check(tmp_path, record)
-    monkeypatch.setenv("XDG_STATE_HOME", "relative")  # would lie in the working folder
+    monkeypatch.setenv("XDG_STATE_HOME", "relative")  # would be in the working folder
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     trust.remember(record)
@@ -246,23 +246,23 @@ def test_where_no_record_can_be_kept_nothing_is_trusted(
 
 
 @pytest.mark.parametrize("name", ["lock", ".config.json.part", "checkpoints/00000020", "replay"])
-def test_no_link_out_of_a_run_is_written_through(
-    stranger: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+def test_resume_refuses_links_out_of_the_run(
+    untrusted: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    outside, link = tmp_path / "outside", stranger / name
+    outside, link = tmp_path / "outside", untrusted / name
     outside.write_text("precious")
     if link.exists() and not link.is_dir():
         link.unlink()
     elif link.exists():
         shutil.rmtree(link)
     link.symlink_to(outside)
-    assert main(["resume", str(stranger), "--steps", "40"]) == 2
+    assert main(["resume", str(untrusted), "--steps", "40"]) == 2
     assert f"{link} is a link to {outside}, outside of the run" in capsys.readouterr().err
     assert outside.read_text() == "precious"
 
 
 def test_the_working_folder_is_not_searched(tmp_path: Path) -> None:
-    """`python -m` would search it first."""
+    """`python -m` would search the working folder first."""
     for name in ("gymnasium", "numpy", "typing", "logging", "dm_control"):
         plant(tmp_path / f"{name}.py")
     command = [sys.executable, "-m", "merl.cli", "--version"]
@@ -280,6 +280,6 @@ def test_the_working_folder_is_not_searched(tmp_path: Path) -> None:
     assert not (tmp_path / "imported").exists()
 
 
-def test_spaces_are_read_without_code(trained: Path) -> None:
+def test_spaces_are_read_without_running_code(trained: Path) -> None:
     observation, _ = Run.open(trained).spaces()
     assert observation["state"] == spaces.Box(-1, 1, (2,))

@@ -1,1 +1,1 @@
-import merl.tasks  # noqa: F401  (before dm_control: it keeps the import from looking for OpenGL)
+import merl.tasks  # noqa: F401  (before dm_control, which then does not look for OpenGL)

@@ -1,4 +1,4 @@
-"""move_box and lift_box: their starts, their rewards in the simulation, what the camera sees."""
+"""move_box and lift_box: starts, rewards in the simulation, visibility to the camera."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def put_box(episodes, position):
 
 
 class Segmentation:
-    """Counts the pixels of geoms as the tasks' camera sees them."""
+    """A counter of the pixels of geoms in the image of the tasks' camera."""
 
     def __init__(self, physics, size):
         self._renderer = RasterRenderer(physics, jaco.CAMERA.name, size)
@@ -39,17 +39,17 @@ def box_geom(episodes):
     return int(episodes.physics.bind(episodes.task.prop.geom).element_id)
 
 
-def test_starts_lie_within_their_boxes_and_touch_nothing(episodes):
+def test_starts_are_in_their_regions_and_without_contact(episodes):
     check_starts(episodes, range(10), BOX_HALF_SIZE)
 
 
 @pytest.mark.long
-def test_yaw_and_fingers_start_anywhere(episodes):
+def test_yaw_and_finger_closure_at_the_start_are_uniform(episodes):
     check_uniform(*check_starts(episodes, range(500), BOX_HALF_SIZE))
 
 
-def check_fast_starts(episodes, seeds):
-    """The first and the tenth start are those of an environment that compiles in every episode."""
+def check_starts_equal_recompiled_ones(episodes, seeds):
+    """Check that starts 1 and 10 equal those of an environment that compiles in every episode."""
     task = make_task(episodes.name, occluded=episodes.occluded)
     slow = composer.Environment(task, time_limit=10.0)
     for seed in seeds:
@@ -64,16 +64,16 @@ def check_fast_starts(episodes, seeds):
     slow.close()
 
 
-def test_starts_are_those_of_the_slow_way(episodes):
-    check_fast_starts(episodes, range(2))
+def test_starts_equal_those_of_a_recompiled_model(episodes):
+    check_starts_equal_recompiled_ones(episodes, range(2))
 
 
 @pytest.mark.long
-def test_a_hundred_starts_are_those_of_the_slow_way(episodes):
-    check_fast_starts(episodes, range(100))
+def test_100_starts_equal_those_of_a_recompiled_model(episodes):
+    check_starts_equal_recompiled_ones(episodes, range(100))
 
 
-def test_box_and_target(episodes):
+def test_box_target_and_state(episodes):
     physics, task = episodes.start(0), episodes.task
     geom = physics.bind(task.prop.geom)
     assert physics.model.body_mass[physics.model.geom_bodyid[geom.element_id]] == BOX_MASS == 0.1
@@ -93,7 +93,7 @@ def test_box_and_target(episodes):
     np.testing.assert_allclose(state[42:45] + relative[61:], state[55:58], atol=1e-6)
 
 
-def test_success_and_rewards_follow_the_distances(episodes):
+def test_success_and_rewards_depend_on_the_distances(episodes):
     task, draw = episodes.task, np.random.RandomState(0)
     physics = episodes.start(1)
     for distance in draw.uniform(0.0, 0.15, 200):
@@ -136,16 +136,16 @@ def test_staged_reward_pays_most_within_one_centimetre_of_the_target(name):
     assert terms(hand + np.array([0.051, 0.0, 0.0]))["success"] == 0.0
 
 
-def test_doing_nothing_is_paid_for_an_upright_hand_alone(episodes):
-    """The hand starts vertical: a rising return proves little until it passes this one."""
+def test_reward_at_the_start_is_only_for_an_upright_hand(episodes):
+    """The hand starts vertical: a return up to this reward does not show any learning."""
     terms = episodes.task.reward_terms(episodes.start(4))
     assert sum(terms.values()) == pytest.approx(
         0.25 if episodes.name == "lift_box" else 0, abs=0.01
     )
 
 
-def test_the_box_at_rest_can_succeed():
-    """The target of move_box lies where a box on the floor can be."""
+def test_a_box_at_rest_on_the_target_is_a_success():
+    """The target of move_box is a position that a box on the floor can reach."""
     episodes = Episodes("move_box")
     physics = episodes.start(0)
     put_box(episodes, (0.0, -0.2, 0.03))
@@ -153,7 +153,7 @@ def test_the_box_at_rest_can_succeed():
     assert episodes.task.success(physics)
 
 
-def test_the_mark_is_seen_around_the_box_and_touches_nothing():
+def test_the_mark_is_visible_around_the_box_and_has_no_contacts():
     episodes = Episodes("move_box")
     physics = episodes.start(0)
     mark = physics.model.name2id("mark", "geom")
@@ -168,8 +168,8 @@ def test_the_mark_is_seen_around_the_box_and_touches_nothing():
     assert all(mark not in (contact.geom1, contact.geom2) for contact in physics.data.contact)
 
 
-def hidden_shares(name, seeds, size):
-    """Of each start's pixels of the box: the share that the disc hides."""
+def hidden_fractions(name, seeds, size):
+    """Return the fraction of the box's pixels that the disc hides, for each start."""
     occluded, plain = Episodes(name, occluded=True), Episodes(name)
     count, count_plain = (Segmentation(e.physics, size) for e in (occluded, plain))
     shares = []
@@ -185,29 +185,29 @@ def hidden_shares(name, seeds, size):
 
 @pytest.mark.parametrize("name", BOX_TASKS)
 def test_the_disc_hides_half_of_the_box_in_half_of_the_starts(name):
-    assert (hidden_shares(name, range(60), 120) >= 0.5).mean() >= 0.45
+    assert (hidden_fractions(name, range(60), 120) >= 0.5).mean() >= 0.45
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", BOX_TASKS)
 def test_the_disc_hides_half_of_the_box_in_half_of_a_thousand_starts(name):
-    assert (hidden_shares(name, range(1000), 240) >= 0.5).mean() >= 0.5
+    assert (hidden_fractions(name, range(1000), 240) >= 0.5).mean() >= 0.5
 
 
-def test_tasks_by_name():
+def test_make_task_finds_tasks_and_rejects_unsupported_options():
     assert list(TASKS) == ["reach_duplo", "move_box", "lift_box"]
     with pytest.raises(MerlError, match="did you mean 'move_box'"):
         make_task("move_boxes")
     with pytest.raises(MerlError, match="reach_duplo has no occluded form: choose from move_box"):
         make_task("reach_duplo", occluded=True)
-    with pytest.raises(MerlError, match="is solved where the hand starts around"):
+    with pytest.raises(MerlError, match="reach_duplo has no start 'around', only 'above'"):
         make_task("reach_duplo", starts=("around",))
     with pytest.raises(MerlError, match="occluded needs --start above"):
         make_task("lift_box", occluded=True, starts=("around",))
 
 
 @pytest.mark.parametrize("name", BOX_TASKS)
-def test_the_hand_can_start_around_the_box_and_touches_nothing(name):
+def test_the_hand_can_start_around_the_box_without_contact(name):
     episodes, above = Episodes(name, starts=("around",)), Episodes(name)
     task, offsets, velocities = episodes.task, [], []
     for seed in range(50):
@@ -229,8 +229,8 @@ def test_the_hand_can_start_around_the_box_and_touches_nothing(name):
 
 
 @pytest.mark.parametrize("name", BOX_TASKS)
-def test_the_hand_can_start_with_the_box_in_it(name):
-    """Three fingers are around it: what the arm does then, the box does too."""
+def test_the_hand_can_start_holding_the_box(name):
+    """All three fingers hold the box: it follows the motion of the arm."""
     episodes = Episodes(name, starts=("holding",))
     task, follows = episodes.task, []
     for seed in range(10):
@@ -247,16 +247,16 @@ def test_the_hand_can_start_with_the_box_in_it(name):
 
 
 @pytest.mark.parametrize("name", BOX_TASKS)
-def test_the_hand_can_start_with_the_box_on_its_way_to_the_target(name):
-    """Anywhere on the straight way, also at its ends, and there it is held."""
+def test_the_hand_can_start_carrying_the_box(name):
+    """The box is anywhere on the straight way, ends included, and the hand holds it."""
     episodes, above = Episodes(name, starts=("carrying",)), Episodes(name)
     task, shares, held = episodes.task, [], []
     for seed in range(30):
-        lay = above.task.prop_position(above.start(seed))
+        before = above.task.prop_position(above.start(seed))
         physics = episodes.start(seed)
-        way, gone = task.target - lay, task.prop_position(physics) - lay
-        shares.append(gone @ way / (way @ way))
-        np.testing.assert_allclose(gone, shares[-1] * way, atol=2e-3)
+        way, moved = task.target - before, task.prop_position(physics) - before
+        shares.append(moved @ way / (way @ way))
+        np.testing.assert_allclose(moved, shares[-1] * way, atol=2e-3)
         assert task.hand_distance(physics) < 0.03
         assert task.tilt_cosine(physics) > 0.99
         control = np.zeros(physics.model.nu)
@@ -264,7 +264,7 @@ def test_the_hand_can_start_with_the_box_on_its_way_to_the_target(name):
         for _ in range(25):
             physics.set_control(control)
             physics.step(task.physics_steps_per_control_step)
-        held.append(np.linalg.norm(task.prop_position(physics) - lay - gone) < 0.03)
+        held.append(np.linalg.norm(task.prop_position(physics) - before - moved) < 0.03)
     assert min(shares) > -0.01
     assert max(shares) < 1.01
     assert np.std(shares) == pytest.approx(12**-0.5, rel=0.3)
@@ -272,7 +272,7 @@ def test_the_hand_can_start_with_the_box_on_its_way_to_the_target(name):
 
 
 def test_a_box_slides_on_the_floor_with_a_friction_of_one():
-    """At 0.5 m/s it comes to rest after v^2 / (2 mu g)."""
+    """A box at 0.5 m/s stops after v^2 / (2 mu g)."""
     episodes, speed, friction = Episodes("move_box"), 0.5, 1.0
     physics = episodes.start(0)
     before = episodes.task.prop_position(physics)
@@ -282,7 +282,7 @@ def test_a_box_slides_on_the_floor_with_a_friction_of_one():
     assert slid == pytest.approx(speed**2 / (2 * friction * 9.81), rel=0.25)
 
 
-def test_of_several_starts_one_is_drawn():
+def test_each_episode_draws_one_of_several_starts():
     episodes = Episodes("lift_box", starts=("above", "around"))
     near = [episodes.task.hand_distance(episodes.start(seed)) < 0.05 for seed in range(30)]
     assert 5 < sum(near) < 25

@@ -1,4 +1,4 @@
-"""Every task can be solved, and the experts do it without touching the simulation."""
+"""The experts solve every task, and only read the simulation."""
 
 import numpy as np
 import pytest
@@ -19,8 +19,8 @@ TASKS = [
 ]
 
 
-class Solved(Episodes):
-    """A task and its expert."""
+class ExpertEpisodes(Episodes):
+    """Episodes of a task that its expert solves."""
 
     def __init__(self, name, **form):
         super().__init__(name, **form)
@@ -51,19 +51,19 @@ class Solved(Episodes):
 
 
 @pytest.mark.parametrize(("name", "form"), TASKS)
-def test_the_expert_solves_the_task(name, form):
-    assert Solved(name, **form).is_solved(0)
+def test_expert_solves_the_task(name, form):
+    assert ExpertEpisodes(name, **form).is_solved(0)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "form"), TASKS)
-def test_the_expert_solves_a_hundred_starts(name, form):
-    episodes = Solved(name, **form)
+def test_expert_solves_95_of_100_starts(name, form):
+    episodes = ExpertEpisodes(name, **form)
     assert sum(episodes.is_solved(seed) for seed in range(100)) >= 95
 
 
-def test_the_same_start_gives_the_same_velocities():
-    episodes = Solved("lift_box")
+def test_expert_repeats_its_velocities_for_the_same_start():
+    episodes = ExpertEpisodes("lift_box")
     runs = []
     for _ in range(2):
         episodes.start(3)
@@ -71,12 +71,12 @@ def test_the_same_start_gives_the_same_velocities():
     np.testing.assert_array_equal(*runs)
 
 
-def test_it_takes_hold_again_of_a_box_that_it_lost():
-    episodes = Solved("lift_box")
+def test_expert_grasps_a_lost_box_again():
+    episodes = ExpertEpisodes("lift_box")
     episodes.start(0)
     while episodes.task.prop_position(episodes.physics)[2] < 0.06:
         episodes.step()
-    data = episodes.physics.data  # the box's free joint comes last
+    data = episodes.physics.data  # the box's free joint is the last
     data.qpos[-7:], data.qvel[-6:] = (-0.06, 0.03, 0.025, 1.0, 0.0, 0.0, 0.0), 0.0
     episodes.physics.forward()
     for _ in range(EPISODE_STEPS):

@@ -1,4 +1,4 @@
-"""The task against dm_control's own `reach_duplo`."""
+"""`ReachDuplo` compared with dm_control's `reach_duplo`."""
 
 import numpy as np
 import pytest
@@ -33,18 +33,18 @@ def assert_same_start(ours, theirs, seed):
     np.testing.assert_allclose(physics.data.qvel, reference.data.qvel, rtol=0, atol=1e-6)
 
 
-def test_starts_are_those_of_dm_control(ours, theirs):
+def test_starts_equal_those_of_dm_control(ours, theirs):
     for seed in range(5):
         assert_same_start(ours, theirs, seed)
 
 
 @pytest.mark.long
-def test_a_hundred_starts_are_those_of_dm_control(ours, theirs):
+def test_100_starts_equal_those_of_dm_control(ours, theirs):
     for seed in range(100):
         assert_same_start(ours, theirs, seed)
 
 
-def test_motion_and_proprioception_are_those_of_dm_control(ours, theirs):
+def test_motion_and_proprioception_equal_those_of_dm_control(ours, theirs):
     physics = ours.start(0)
     environment, timestep = theirs(0)
     spec = environment.action_spec()
@@ -70,7 +70,7 @@ def test_motion_and_proprioception_are_those_of_dm_control(ours, theirs):
         assert ours.task.get_reward(physics) == pytest.approx(timestep.reward, abs=1e-12)
 
 
-def test_reward_is_that_of_dm_control_at_every_distance(ours, theirs):
+def test_reward_equals_that_of_dm_control_at_every_distance(ours, theirs):
     physics, (environment, _) = ours.start(3), theirs(3)
     reference = environment.physics
     draw = np.random.RandomState(0)
@@ -79,7 +79,7 @@ def test_reward_is_that_of_dm_control_at_every_distance(ours, theirs):
     for distance in distances:
         direction = draw.normal(size=3)
         offset = distance * direction / np.linalg.norm(direction)
-        for simulation in (physics, reference):  # the brick's free joint comes last
+        for simulation in (physics, reference):  # the brick's free joint is the last
             simulation.data.qpos[-7:-4] = ours.task.tool_center_point(physics) + offset
             simulation.forward()
         reward = ours.task.get_reward(physics)
@@ -89,20 +89,20 @@ def test_reward_is_that_of_dm_control_at_every_distance(ours, theirs):
         assert ours.task.success(physics) == (ours.task.distance(physics) <= 0.05)
 
 
-def test_starts_lie_within_their_boxes(ours):
+def test_starts_are_in_their_regions(ours):
     check_starts(ours, range(30), resting_height=0.0)
 
 
 @pytest.mark.long
-def test_yaw_and_fingers_start_anywhere(ours):
+def test_yaw_and_finger_closure_at_the_start_are_uniform(ours):
     check_uniform(*check_starts(ours, range(500), resting_height=0.0))
 
 
-def test_every_task_by_its_name():
+def test_reach_duplo_is_in_the_list_of_tasks():
     assert TASKS["reach_duplo"] is ReachDuplo
 
 
-def test_a_wrong_version_is_met_with_one_sentence(monkeypatch):
+def test_a_wrong_simulator_version_is_rejected_in_one_line(monkeypatch):
     monkeypatch.setattr(simulator, "version", lambda _: "4.0.0")
     with pytest.raises(MerlError, match=r"merl needs mujoco 3\.17\.0, found 4\.0\.0: pip install"):
         simulator.check_versions()

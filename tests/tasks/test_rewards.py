@@ -1,4 +1,4 @@
-"""Eqs. 3 to 5 at points computed by hand, at both sides of every gate, and within their bounds."""
+"""Eqs. 3 to 5 at points computed by hand, on both sides of every gate, and within their bounds."""
 
 import itertools
 from typing import get_args
@@ -15,10 +15,10 @@ NEAR, FAR = 0.0499, 0.0501  # on either side of epsilon_reaching
     ("distance", "expected"),
     [
         (0.0, 1.0),
-        (0.05, 1.0),  # the bound belongs to the goal
+        (0.05, 1.0),  # the bound counts as reached
         (0.0500001, 1.0),
-        (0.075, 0.1**0.25),  # a gaussian: 0.1 to the square of the share of the margin
-        (0.1, 0.1),  # the margin's end
+        (0.075, 0.1**0.25),  # a Gaussian: 0.1 to the power of (fraction of the margin)^2
+        (0.1, 0.1),  # the end of the margin
         (0.15, 0.1**4),
         (1.0, 0.0),
     ],
@@ -35,12 +35,12 @@ def test_reach(distance: float, expected: float) -> None:
         (0.0, 0.0, 0.5, 0.5),
         (NEAR, 0.05, 0.5, 0.5),  # the bound is epsilon_pushing
         (NEAR, 0.0500001, 0.5, 0.5),
-        (NEAR, 0.1, 0.5, 0.05),  # the margin's end
-        (NEAR, 0.075, 0.5, 0.5 / (1 + 9 * 0.25)),  # a long tail: 1 / (1 + 9 share^2)
+        (NEAR, 0.1, 0.5, 0.05),  # the end of the margin
+        (NEAR, 0.075, 0.5, 0.5 / (1 + 9 * 0.25)),  # a long tail: 1 / (1 + 9 fraction^2)
         (NEAR, 0.25, 0.5, 0.5 / (1 + 9 * 16)),
         (0.05, 0.0, 0.5, 0.0),  # the gate is open strictly below epsilon_reaching
         (FAR, 0.0, 0.5, 0.0),
-        (0.1, 0.0, 0.05, 0.0),  # a box that was thrown to its target pays nothing
+        (0.1, 0.0, 0.05, 0.0),  # a thrown box at its target gets no reward
     ],
 )
 def test_move(hand: float, goal: float, reaching: float, pushing: float) -> None:
@@ -79,8 +79,8 @@ def test_staged_move(hand: float, goal: float, expected: tuple[float, ...]) -> N
         (NEAR, 0.1, 0.08, (1.0, 1.0, 1.0, 1 / (1 + 9 * 0.36), 1 / (1 + 9 * 49))),  # full at 0.1
         (NEAR, 0.065, 0.115, (1.0, 1.0, 0.5, 1 / (1 + 9 * 1.69), 1 / (1 + 9 * 110.25))),
         (NEAR, 0.0351, 0.01, (1.0, 1.0, 2 * 0.0051 / 0.14, 1.0, 1.0)),
-        (NEAR, 0.035, 0.01, (1.0, 1.0, 0.0, 0.0, 0.0)),  # not above: on the floor
-        (FAR, 0.18, 0.0, (1.0, 1.0, 0.0, 0.0, 0.0)),  # a box that flies by itself
+        (NEAR, 0.035, 0.01, (1.0, 1.0, 0.0, 0.0, 0.0)),  # not above the bound: on the floor
+        (FAR, 0.18, 0.0, (1.0, 1.0, 0.0, 0.0, 0.0)),  # the hand is not at the box
         (NEAR, 0.3, 0.12, (1.0, 1.0, 1.0, 1 / (1 + 9 * 1.96), 1 / (1 + 9 * 121))),  # too high
     ],
 )
@@ -90,7 +90,7 @@ def test_staged_lift(hand: float, height: float, goal: float, expected: tuple[fl
     assert np.array(list(terms.values())) == pytest.approx(np.array(expected) / 5, abs=1e-4)
 
 
-def test_staged_floating_follows_the_height_of_the_target() -> None:
+def test_staged_floating_depends_on_the_height_of_the_target() -> None:
     lifted = rewards.lift(NEAR, 1.0, 0.075, 0.22, 0.145, form="staged")
     assert lifted["floating"] == pytest.approx(2 * 0.045 / 0.18 / 5)
 
@@ -101,9 +101,9 @@ def test_staged_floating_follows_the_height_of_the_target() -> None:
         # reaching, vertical, floating, lifting; each a quarter, the target at 0.18
         (0.0, 1.0, 0.18, 0.0, (1.0, 1.0, 1.0, 1.0)),
         (NEAR, 0.99, 0.0351, 0.05, (1.0, 1.0, 0.195, 1.0)),
-        (NEAR, 0.99, 0.035, 0.0, (1.0, 1.0, 0.0350 / 0.18, 0.0)),  # not above: not off the floor
+        (NEAR, 0.99, 0.035, 0.0, (1.0, 1.0, 0.0350 / 0.18, 0.0)),  # not off the floor
         (NEAR, 1.0, 0.025, 0.155, (1.0, 1.0, 0.025 / 0.18, 0.0)),  # hand at the box on the floor
-        (FAR, 1.0, 0.18, 0.0, (1.0, 1.0, 0.0, 0.0)),  # a box that flies by itself
+        (FAR, 1.0, 0.18, 0.0, (1.0, 1.0, 0.0, 0.0)),  # the hand is not at the box
         (0.3, 0.0, 0.025, 0.2, (0.0, 0.1, 0.0, 0.0)),  # one margin below: 0.1
         (0.3, 0.495, 0.025, 0.2, (0.0, 0.1**0.25, 0.0, 0.0)),
         (0.3, -1.0, 0.025, 0.2, (0.0, 0.1 ** (1.99 / 0.99) ** 2, 0.0, 0.0)),
@@ -123,7 +123,7 @@ def test_lift(
     ("cosine", "expected"),
     [(1.0, 1.0), (0.4, 1.0), (0.39, 0.1 ** (0.01 / 0.4) ** 2), (0.2, 0.1**0.25), (0.0, 0.1)],
 )
-def test_vertical_bound_of_the_occluded_form_is_also_its_margin(
+def test_vertical_bound_of_the_occluded_task_is_also_its_margin(
     cosine: float, expected: float
 ) -> None:
     vertical = rewards.lift(0.3, cosine, 0.025, 0.22, 0.2, vertical_cosine=0.4)["vertical"]

@@ -203,7 +203,7 @@ def test_a_video_without_a_frame_rate_has_25_frames_a_second(
     assert train("--eval.video", "each", "--action-repeat", "2") == 0
     assert len(list(Path("run/videos").glob("*.mp4"))) == 3
     said = " ".join(capsys.readouterr().out.split())
-    assert said.count("no usable render_fps: its videos have 25 frames a second") == 1
+    assert said.count("no usable render_fps: its videos have 25 frames per second") == 1
 
 
 def test_a_video_of_wrong_frames_is_dropped_with_one_warning(
@@ -260,7 +260,7 @@ def test_without_evaluations_the_environment_is_made_once(
     assert len(unruly_envs.made) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "is trained and saved, and not evaluated" in said
-    assert "go on with" in said
+    assert "resume with" in said
     assert "warning" not in said
     assert evaluated() == []
     assert main(["resume", "run"]) == 0
@@ -319,7 +319,7 @@ def test_a_simulator_that_dies_of_the_signal_does_not_make_it_a_failure(
     unruly.in_training = unruly_envs.interrupted(number, error)
     assert train() == 128 + number
     said = capsys.readouterr()
-    assert "and saved: go on with" in said.out
+    assert "and saved: resume with" in said.out
     assert said.err == ""
     unruly.in_training = None
     assert main(["resume", "run"]) == 0
@@ -340,7 +340,7 @@ def test_a_handler_of_the_environments_does_not_make_ctrl_c_useless(
     before = signal.getsignal(signal.SIGINT)
     unruly.in_training = unruly_envs.takes_over_signals
     assert train() == 130
-    assert "and saved: go on with" in capsys.readouterr().out
+    assert "and saved: resume with" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGINT) is before
 
 

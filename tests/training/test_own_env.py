@@ -169,7 +169,7 @@ def test_nothing_but_training_and_evaluation_moves_a_users_robot(
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     assert moves(tmp_path, "--eval.video", "none") == (10 + 2 + 3, 100 + 20)  # two are compared
     said = " ".join(capsys.readouterr().out.split())
-    assert "100 steps of test_own_env:Logged on cpu (how long they take is said after" in said
+    assert "100 steps of test_own_env:Logged on cpu (their duration is printed after" in said
     assert "49 steps of test_own_env:Logged on cpu take about 0:00:0" in said
     assert "nothing to compare with (--eval.references takes 20 episodes" in said
     assert moves(tmp_path) == (10 + 2 + 3 + 1, 100 + 20)  # whether it can be filmed
@@ -183,7 +183,7 @@ def test_pendulum(agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     run = tmp_path / "run"
     arguments = ["train", "Pendulum-v1", "--agent", agent, *SHORT, "--steps", "400"]
     assert main([*arguments, "--run-dir", str(run)]) == 0
-    assert "pictures" not in capsys.readouterr().out
+    assert "raster images" not in capsys.readouterr().out
     record = json.loads((run / "config.json").read_text())
     assert (record["agent"], list(record["observation_space"])) == (agent, ["state"])
     assert main(["resume", str(run), "--steps", "600"]) == 0
@@ -309,7 +309,10 @@ def test_an_arm_that_has_become_another_is_refused(
     for change, says in {
         ("LIMIT = 1.5", "LIMIT = 9.5"): "bounds was low [-1.5, -1.5], high [1.5, 1.5] and is low",
         ("(4,)", "(5,)"): "'joints' was float32 (4,) and is float32 (5,)",
-        ('"joints": spaces', '"more": spaces.Box(0, 1, (1,)), "joints": spaces'): "'more' was not",
+        (
+            '"joints": spaces',
+            '"more": spaces.Box(0, 1, (1,)), "joints": spaces',
+        ): "'more' was missing",
         ("(2,), np", "(3,), np"): "action was float32 (2,) and is float32 (3,)",
     }.items():
         module.write_text(whole.replace(*change))
@@ -344,23 +347,23 @@ def test_an_arm_that_has_become_another_is_refused(
         (["Reachr-v4"], "did you mean 'Reacher-v4'"),
         (["Kitchen-v7"], "is unknown: choose from reach_duplo, move_box, lift_box, or name a"),
         (["FetchReach-v4"], "package gymnasium-robotics: pip install 'gymnasium-robotics', then"),
-        (["FetchReach-v4"], "name it gymnasium_robotics:FetchReach-v4"),
+        (["FetchReach-v4"], "use the task gymnasium_robotics:FetchReach-v4"),
         (
             ["gymnasium_robotics:FetchReach-v4"],
             "it comes with the package gymnasium-robotics: pip install",
         ),
         (["AdroitHandDoor-v1"], "package gymnasium-robotics"),
         (["AntMaze_UMaze-v4"], "package gymnasium-robotics"),
-        (["PandaReach-v3"], "name it panda_gym:PandaReach-v3"),
-        (["ALE/Pong-v5"], "name it ale_py:ALE/Pong-v5"),
+        (["PandaReach-v3"], "use the task panda_gym:PandaReach-v3"),
+        (["ALE/Pong-v5"], "use the task ale_py:ALE/Pong-v5"),
         (["PongNoFrameskip-v4"], "package ale-py"),
         (["dm_control/cheetah-run-v0"], "pip install 'shimmy[dm-control]'"),
-        (["os:getcwd"], "gave str"),
-        (["./my_robot.py:make"], "write it as my_robot:make_env"),
-        ([":Foo"], "write it as my_robot:make_env"),
+        (["os:getcwd"], "returned str"),
+        (["./my_robot.py:make"], "use module:function, for example my_robot:make_env"),
+        ([":Foo"], "use module:function, for example my_robot:make_env"),
         (["gymnasium:make"], "takes no arguments"),
-        (["merl/MoveBox-v0"], "call it move_box"),
-        (["merl:merl/MoveBox-v0"], "call it move_box"),
+        (["merl/MoveBox-v0"], "use its name, move_box"),
+        (["merl:merl/MoveBox-v0"], "use its name, move_box"),
         (["merl.envs.dot:whole", "--agent", "ddpg", "--agent.vectors", "x"], "have it give 'x'"),
     ],
 )
@@ -384,4 +387,4 @@ def test_the_newest_version_of_an_outdated_environment_is_named(
 ) -> None:
     assert main(["train", "Ant-v3", "--agent", "sac", "--preset", "smoke"]) == 2
     last = capsys.readouterr().err.strip().splitlines()[-1]  # Gymnasium warns before
-    assert last.endswith("take its newest version, Ant-v5")
+    assert last.endswith("use its newest version, Ant-v5")

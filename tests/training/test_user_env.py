@@ -127,7 +127,7 @@ def test_every_modality_is_used_and_the_rest_is_said(
         expected = [start + ", ".join(words[key] for key in keys)] if keys else []
         assert [line for line in lines if line.startswith(start)] == expected
     left_out = lines[-1]
-    assert "'gear' is not used: Discrete(3): give it as one-hot" in left_out
+    assert "'gear' is not used: Discrete(3): encode it as one-hot" in left_out
     for key in words:
         assert (f"{key!r} is not used: " in left_out) == (key not in [*images, *vectors, *critic])
 
@@ -207,11 +207,11 @@ def test_a_policy_takes_tensors_and_names_what_it_cannot_take(tmp_path: Path) ->
     np.testing.assert_array_equal(policy(tensors), action)  # type: ignore[arg-type]
     for key, value, says in (
         ("joints", [[1.0], [1.0, 2.0]], "cannot be converted"),
-        ("joints", None, "'joints' holds something that is not a number: None"),
+        ("joints", None, "'joints' contains a value that is not a number: None"),
         ("joints", np.zeros(3), r"'joints' has shape \(3,\)"),
         ("joints", np.full(4, 1e300), "beyond float32"),
-        ("pixels", observation["pixels"] / 255, "'pixels' is of float64"),
-        ("mask", observation["mask"] + 1, "but its space says 0 to 1"),
+        ("pixels", observation["pixels"] / 255, "'pixels' has dtype float64"),
+        ("mask", observation["mask"] + 1, "but its space has 0 to 1"),
     ):
         with pytest.raises(MerlError, match=says) as caught:
             policy(observation | {key: value})
@@ -330,7 +330,7 @@ class Changing(Toy):
     ("change", "says"),
     [
         ("shape", r"'state' is a float32 box \(3,\) .* and a float32 box \(4,\)"),
-        ("key", "'joints' is not there and a float32 box"),
+        ("key", "'joints' is missing and a float32 box"),
         ("pixels", r"'image' is .* from 0 to 255 and .* from 0 to 1"),
         ("bounds", r"the actions' bounds is low \[-1.0, -1.0\].* and low \[-2.0, -2.0\]"),
         ("actions", r"action is a float32 box \(2,\) .* and a float32 box \(3,\)"),
@@ -367,7 +367,7 @@ def test_a_worker_compares_its_instance_with_the_first(monkeypatch: pytest.Monke
 
 def test_how_spaces_are_read_is_part_of_the_config() -> None:
     config = compose("smoke", f"{here}:Wide")
-    with pytest.raises(MerlError, match=r"say --env.allow-wide-actions"):
+    with pytest.raises(MerlError, match=r"use --env.allow-wide-actions"):
         make_run_env(config)
     allowed = dataclasses.replace(config, user_env=UserEnvConfig(allow_wide_actions=True))
     assert make_run_env(allowed).action_space == spaces.Box(-1, 1, (2,), np.float32)

@@ -1,1 +1,1 @@
-"""Acting: environments, here or in worker processes, and what an agent sees of them."""
+"""Acting: environments in this process or in worker processes, and the frame stack."""

@@ -1,4 +1,4 @@
-"""Checks of a user's environment at the start of a run: what would make its numbers wrong."""
+"""Checks of a user's environment at the start of a run, for faults that falsify the results."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ NORMALIZERS = (
 
 
 def refuse_running_statistics(env: gymnasium.Env[Any, Any]) -> None:
-    """Refuse an environment that scales observations or rewards by running statistics.
+    """Reject an environment that scales observations or rewards with running statistics.
 
     Training, evaluation and the loaded policy each have their own instance of the environment, and
-    would each scale by other statistics. Statistics that are frozen (`update_running_mean` is
-    false) are accepted.
+    each would scale with different statistics. Frozen statistics (`update_running_mean` is false)
+    are accepted.
 
     Raises:
-        MerlError: naming the wrapper.
+        MerlError: there are running statistics; the message names the wrapper.
     """
     layers = [layer for layer in _inner_environments(env) if _has_running_statistics(layer)]
-    if layers:  # the innermost one has them, the others hold it
+    if layers:  # the last one is the innermost: it owns the statistics
         raise MerlError(
             f"the environment is wrapped in {type(layers[-1]).__name__}, whose running statistics "
-            "would differ between training, evaluation and the saved policy: take it off; "
-            "--agent.standardize scales the observed vectors with statistics that belong to "
-            "the agent"
+            "would differ between training, evaluation and the saved policy: remove the wrapper; "
+            "--agent.standardize scales the observed vectors with statistics that are saved "
+            "with the agent"
         )
 
 
 def check_instances(env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, Any]) -> None:
-    """Warn if training and evaluation share one object, or if starts depend on the past.
+    """Warn if training and evaluation share one object, or if a reset depends on earlier resets.
 
-    The evaluation's environment is reset with one seed, with another, and with the first again, and
-    takes no step. An observation that is filtered, normalised or collected across resets differs
-    the second time, and
-    so does one that does not follow from the seed (a real robot, an environment that ignores it).
-    Statistics that only change in `step` are not seen here.
+    The evaluation environment is reset with one seed, with another seed, and with the first seed
+    again; it takes no step. The first observations with the same seed differ if a wrapper filters,
+    normalises or collects observations across resets, or if the seed does not determine the
+    observation (a real robot, or an environment that ignores the seed). State that changes only in
+    `step` is not detected.
 
     Raises:
         MerlError: the environment cannot be reset.
@@ -67,14 +67,15 @@ def check_instances(env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, A
     if differing:
         warnings.warn(
             f"the first observation after resets with the same seed differs in "
-            f"{', '.join(map(repr, differing))}: evaluations will not start alike, and a wrapper "
-            "that keeps state across resets makes the trained policy see other numbers later",
+            f"{', '.join(map(repr, differing))}: evaluations will not have the same start states; "
+            "if a wrapper keeps state across resets, the trained policy will later get different "
+            "observations",
             stacklevel=1,
         )
 
 
 def _inner_environments(env: Any) -> Iterator[Any]:
-    """The environment and all environments inside it, whatever the attribute is called."""
+    """Yield the environment and all environments inside it, under any attribute name."""
     found, seen = [env], set[int]()
     while found:
         layer = found.pop()
@@ -86,7 +87,7 @@ def _inner_environments(env: Any) -> Iterator[Any]:
 
 
 def _is_environment(value: Any) -> bool:
-    """Whether a value is an environment, of Gymnasium or of a library with the same methods."""
+    """Return whether a value is an environment of Gymnasium or of a similar library."""
     if isinstance(value, gymnasium.Env | VectorEnv):
         return True
     return all(callable(getattr(type(value), name, None)) for name in ("reset", "step"))
@@ -95,7 +96,7 @@ def _is_environment(value: Any) -> bool:
 def _has_running_statistics(layer: Any) -> bool:
     if not getattr(layer, "update_running_mean", True):
         return False
-    # Other libraries and users build such wrappers around a class of this name, too.
+    # Other libraries and users often name the class of their statistics `RunningMeanStd`, too.
     kinds = (kind for value in held_by(layer) for kind in type(value).__mro__)
     return isinstance(layer, NORMALIZERS) or any(
         kind.__name__ == "RunningMeanStd" for kind in kinds
@@ -103,7 +104,7 @@ def _has_running_statistics(layer: Any) -> bool:
 
 
 def _first_observation(env: gymnasium.Env[Any, Any], seed: int) -> Mapping[str, Any]:
-    seed_global_generators(seed)  # as an evaluation does
+    seed_global_generators(seed)  # as in an evaluation
     observation: Mapping[str, Any] = env.reset(seed=seed)[0]
     return {key: np.array(value) for key, value in observation.items()}
 

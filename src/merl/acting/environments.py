@@ -1,7 +1,7 @@
-"""Where the agent acts: an environment in this process, or several in processes of their own.
+"""Environments for acting: one in this process, or several in worker processes.
 
-Both are spoken to in the same way: `send` actions, `receive` what they led to. In between,
-environments in processes of their own step while the learner learns.
+Both have the same interface: `send` actions, then `receive` the results. Between these calls,
+environments in worker processes step while the learner updates.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from merl.core.python_path import set_value, users_value, working_folder_hidden
 from merl.envs.user_env import imports_code, load_module, module_folder
 
 _INFO = ("success", "reward_terms")
-"""What the loop wants to know beside the reward."""
-_TOLD = "told"
-"""The only key of a worker's info; under it lies what its environment told of `_INFO`."""
-_LEFT_TO_THE_RUN = (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
-"""A terminal or a batch system sends them to the workers too, which are to work on until the run
-has saved and ends them. SIGTERM is what they are ended by."""
+"""Keys of an environment's info that the training loop uses."""
+_INFO_KEY = "reported"
+"""The only key of a worker's info; its value holds the `_INFO` entries of the environment."""
+_IGNORED_SIGNALS = (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
+"""Signals that workers ignore: a terminal or a batch system sends them to the workers, too, but the
+workers must continue until the run has saved and ends them. SIGTERM ends a worker."""
 START_SECONDS = 300.0
-"""In which all processes must have made their environments."""
+"""Time limit within which all processes must have made their environments."""
 END_SECONDS = 5.0
-"""In which they must have ended, before they are killed."""
+"""Time limit within which the processes must have ended; after that they are killed."""
 
 
 class Step(NamedTuple):
-    """What an action led to; see `gymnasium.Env.step`."""
+    """The result of one environment step; see `gymnasium.Env.step`."""
 
     observation: Observation
     reward: float
@@ -59,73 +59,78 @@ class Step(NamedTuple):
     info: Mapping[str, Any]
 
 
-class WorkerDied(Exception):  # noqa: N818 (no error as long as it can be mended)
-    """A process of an environment died or does not answer: the episodes in progress are lost."""
+class WorkerDied(Exception):  # noqa: N818 (the run restarts the workers)
+    """A worker process died or does not answer: the episodes in progress are lost."""
 
 
 class Environments(Protocol):
-    """One environment or several, that are stepped together.
+    """One or several environments that step together.
 
     Attributes:
-        count: how many there are.
-        action_shape: of one action, (A,).
+        count: number of environments.
+        action_shape: shape of one action, (A,).
     """
 
     count: int
     action_shape: tuple[int, ...]
 
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
-        """Start an episode in each environment named, with its seed if it has one.
+        """Start an episode in each of the given environments.
 
-        A seed also seeds the global generators of the process that the environment lives in.
+        Args:
+            seeds: environment index -> seed, or None for no seed. A seed also seeds the global
+                random generators of the environment's process.
+
+        Returns:
+            The first observation of each of these environments.
 
         Raises:
-            Lost: a process died.
+            WorkerDied: a process died or did not answer.
         """
         ...
 
     def send(self, actions: NDArray[np.float32]) -> None:
-        """Have every environment take its action, (count, A) in [-1, 1].
+        """Start a step in every environment with its action, (count, A) in [-1, 1].
 
         Raises:
-            Lost: a process died.
+            WorkerDied: a process died.
         """
         ...
 
     def receive(self) -> list[Step]:
-        """What the actions led to, once they all have.
+        """Wait for all environments and return the results of their steps.
 
         Raises:
-            Lost: a process died, or is late.
+            WorkerDied: a process died or did not answer in time.
         """
         ...
 
     def states(self) -> list[dict[str, Any]]:
-        """Return `environment_state()` of each one."""
+        """Return the `environment_state()` of each environment."""
         ...
 
     def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
-        """Take back what `states` gave."""
+        """Restore from `states()`."""
         ...
 
     def restart(self) -> None:
-        """Make them anew, after one was lost.
+        """Start all environments again after one was lost.
 
         Raises:
-            Lost: they cannot be started.
+            WorkerDied: they cannot be started.
         """
         ...
 
     def close(self) -> None:
-        """End them."""
+        """Close all environments."""
         ...
 
 
 class InProcessEnvs:
-    """One environment in this process: nothing happens between `send` and `receive`.
+    """One environment in this process; it steps inside `receive`.
 
     Args:
-        env: the environment; who made it closes it.
+        env: the environment; the caller closes it.
     """
 
     count = 1
@@ -162,36 +167,36 @@ class InProcessEnvs:
         set_environment_state(self._env, states[0])
 
     def restart(self) -> None:
-        """See `Environments`; it is never lost."""
+        """Do nothing: an environment in this process is never lost."""
 
     def close(self) -> None:
         """See `Environments`."""
 
 
 class WorkerEnvs:
-    """Environments in processes of their own, which step at the same time.
+    """Environments in worker processes that step in parallel.
 
-    They are spawned (a fork with OpenGL or with threads hangs), give their observations through
-    shared memory, and end with this process. When one of them dies, or does not answer in time, all
-    are started again by `restart`.
+    The processes are spawned (a fork with OpenGL or threads hangs), return observations through
+    shared memory, and end with this process. If one dies or does not answer in time, `restart`
+    starts all of them again.
 
     Args:
-        config: of the run; `num_envs`, and `worker_timeout` in seconds.
-        here: the same environment in this process, which lends its spaces and stays as it is.
+        config: the config of the run; uses `num_envs` and `worker_timeout` (seconds).
+        here: the same environment in this process; only its spaces are used.
 
     Raises:
-        EnvironmentsLost: they cannot be started.
+        EnvironmentsLost: the processes cannot be started.
     """
 
     def __init__(self, config: TrainConfig, here: gymnasium.Env[Any, Any]) -> None:
         self.count, self.action_shape = config.num_envs, here.action_space.shape or ()
         self._config, self._here, self._timeout = config, here, config.worker_timeout
-        self._lost: str | None = None  # what became of a process
+        self._lost: str | None = None  # why a process is lost
         try:
             self._env = self._started()
         except WorkerDied as lost:
             raise EnvironmentsLost(
-                f"an environment's process {lost} while it was started: see what it said above"
+                f"an environment's process {lost} while it started: see its output above"
             ) from None
 
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
@@ -219,7 +224,7 @@ class WorkerEnvs:
                 float(rewards[index]),
                 bool(terminated[index]),
                 bool(truncated[index]),
-                infos[_TOLD][index][0],
+                infos[_INFO_KEY][index][0],
             )
             for index in range(self.count)
         ]
@@ -243,7 +248,7 @@ class WorkerEnvs:
 
     @contextmanager
     def _loss(self) -> Iterator[None]:
-        """Raise `WorkerDied` for a process that has died; ask nothing more until a restart."""
+        """Convert a lost process into `WorkerDied`, in all later calls too, until a restart."""
         if self._lost is not None:
             raise WorkerDied(self._lost)
         try:
@@ -253,7 +258,7 @@ class WorkerEnvs:
         except (EOFError, ConnectionError):
             self._lost = "died"
         except MerlError:
-            self._lost = "failed"  # its pipe is closed: nothing more can be asked of it
+            self._lost = "failed"  # its pipe is closed, so it cannot be used again
             raise
         if self._lost is not None:
             raise WorkerDied(self._lost)
@@ -278,7 +283,7 @@ class WorkerEnvs:
             ),
             working_folder_hidden(),
         ):
-            # What a worker raises is raised here; Gymnasium would print it, too.
+            # The exception of a worker is raised here; Gymnasium must not print it as well.
             gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
             return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
 
@@ -287,14 +292,14 @@ class WorkerEnvs:
 def _killing_after(
     seconds: float, processes: Callable[[], Iterable[BaseProcess]]
 ) -> Iterator[None]:
-    """Kill processes if the work takes longer: whoever waits for them goes on."""
-    impatience = Timer(seconds, lambda: _kill(processes()))
-    impatience.daemon = True
-    impatience.start()
+    """Kill processes if the block takes longer, so that waiting for them ends."""
+    timer = Timer(seconds, lambda: _kill(processes()))
+    timer.daemon = True
+    timer.start()
     try:
         yield
     finally:
-        impatience.cancel()
+        timer.cancel()
 
 
 def _kill(processes: Iterable[BaseProcess]) -> None:
@@ -303,25 +308,25 @@ def _kill(processes: Iterable[BaseProcess]) -> None:
 
 
 def _end(env: AsyncVectorEnv) -> None:
-    """End the processes, whatever state they are in."""
+    """End the worker processes in any state."""
     with _killing_after(END_SECONDS, lambda: env.processes):
         try:
             env.close()
-        except Exception:  # a pipe or a process is gone: no way to end in good order
+        except Exception:  # a pipe or a process is lost: a regular close is impossible
             _kill(env.processes)
-            env._state = AsyncState.DEFAULT  # nothing will answer what it waits for
+            env._state = AsyncState.DEFAULT  # do not wait for an answer
             with suppress(Exception):
                 env.close(terminate=True)
 
 
 def _nth(batch: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """One environment's part of a batched observation."""
+    """Return the observation of one environment from a batched observation."""
     return {key: value[index] for key, value in batch.items()}
 
 
 @contextmanager
-def _errors_that_arrive() -> Iterator[None]:
-    """Replace an exception that cannot be pickled: the other process would wait for it forever."""
+def _picklable_errors() -> Iterator[None]:
+    """Replace an exception that cannot be pickled; else the main process would wait forever."""
     try:
         yield
     except Exception as error:
@@ -333,7 +338,7 @@ def _errors_that_arrive() -> Iterator[None]:
 
 
 class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment in a process of its own, with what the loop asks of it beside stepping."""
+    """An environment in a worker process, with methods to save and restore its state."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], index: int) -> None:
         super().__init__(env)
@@ -342,33 +347,33 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         if options.get("seed") is not None:
             seed_global_generators(options["seed"])
-        with _errors_that_arrive():
+        with _picklable_errors():
             observation, _ = self.env.reset(**options)
         return observation, {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        with _errors_that_arrive():
+        with _picklable_errors():
             observation, reward, terminated, truncated, info = self.env.step(action)
-        told = {name: info[name] for name in _INFO if name in info}
-        # In a tuple, lest Gymnasium merge it with what the other environments tell.
-        return observation, reward, terminated, truncated, {_TOLD: (told,)}
+        reported = {name: info[name] for name in _INFO if name in info}
+        # In a tuple, so that Gymnasium does not merge it with the info of other environments.
+        return observation, reward, terminated, truncated, {_INFO_KEY: (reported,)}
 
     def state(self) -> dict[str, Any]:
-        with _errors_that_arrive():
+        with _picklable_errors():
             return environment_state(self.env)
 
     def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
-        with _errors_that_arrive():
+        with _picklable_errors():
             set_environment_state(self.env, states[self._index])
 
 
 class _StandIn(gymnasium.Env[Any, Any]):
-    """Has the spaces of an environment, and nothing else.
+    """A dummy environment that only provides spaces.
 
     Args:
-        expected: its spaces.
-        error: why the environment cannot be used; `reset` raises it, since an exception while a
-            worker starts does not reach the run.
+        expected: the spaces.
+        error: raised by `reset`. It tells why the real environment cannot be used; an exception
+            during the start of a worker would not reach the run.
     """
 
     def __init__(self, expected: EnvSpaces, error: MerlError | None = None) -> None:
@@ -383,26 +388,26 @@ class _StandIn(gymnasium.Env[Any, Any]):
 
 @dataclass
 class _Maker:
-    """Makes an environment in the process that it is sent to."""
+    """A function that makes an environment in a worker process."""
 
     config: TrainConfig
     index: int
     expected: EnvSpaces
     here: gymnasium.Env[Any, Any] | None
     folder: Path | None
-    """From which the module of a user's environment was loaded."""
+    """The folder from which the module of a user's environment was loaded."""
     safe_path: str | None = field(default_factory=users_value)
-    """What the user set; the environment may start Python processes of its own."""
+    """The user's value of `PYTHONSAFEPATH`, for Python processes that the environment starts."""
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
         if self.here is not None:
             return _StandIn(self.expected)
-        for number in _LEFT_TO_THE_RUN:
+        for number in _IGNORED_SIGNALS:
             signal.signal(number, signal.SIG_IGN)
         if imports_code(self.config.task):
             set_value(self.safe_path)
         tolerate_lost_output()
-        with _errors_that_arrive():
+        with _picklable_errors():
             if self.folder is not None:
                 load_module(self.config.task, self.folder)
             env = make_run_env(self.config)

@@ -1,8 +1,8 @@
-"""Random generators that an environment may use, beside Gymnasium's `np_random`.
+"""Random generators that an environment may use in addition to Gymnasium's `np_random`.
 
 The global generators of NumPy, Python and torch belong to the whole process. They are seeded with
-the seed of an episode wherever one is given, saved in checkpoints, and an evaluation leaves them,
-and the generators of its environment, as they were.
+the seed of an episode if it has one, and they are saved in checkpoints. An evaluation restores them
+at its end, together with the generators of its environment.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gymnasium import spaces
 def seed_global_generators(seed: int) -> None:
     """Seed the global generators of NumPy, Python and torch."""
     random.seed(seed)
-    np.random.seed(seed % 2**32)  # noqa: NPY002 (the one that environments use)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 (environments use this generator)
     torch.manual_seed(seed)
 
 
@@ -54,11 +54,11 @@ def set_global_state(state: Mapping[str, Any]) -> None:
 
 @contextmanager
 def kept_generators(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
-    """Restore random generators at the end: the global ones, and those of an environment.
+    """Restore the global random generators and those of an environment at the end of the block.
 
-    The environment's are those that it holds as attributes: of each wrapper, of the environment
-    itself, of their classes, modules and spaces. This includes the environment that is trained in,
-    where both are one object or share a generator.
+    The generators of an environment are the attributes of each wrapper, of the environment itself,
+    and of their classes, modules and spaces. If training and evaluation share one environment or
+    one generator, the generators of training are restored, too.
     """
     restore = [*_restorers(env)]
     shared = global_state()
@@ -67,15 +67,15 @@ def kept_generators(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
     try:
         yield
     finally:
-        for put_back in restore:
-            put_back()
+        for restore_one in restore:
+            restore_one()
         set_global_state(shared)
         if cuda is not None:
             torch.cuda.set_rng_state(cuda)
 
 
 def held_by(owner: Any) -> Iterator[Any]:
-    """Yield what an object holds: attributes, items of lists and dicts, and their attributes."""
+    """Yield the attributes of an object, items of lists and dicts, and their attributes."""
     for value in _parts(getattr(owner, "__dict__", {}).values()):
         yield value
         if not isinstance(value, type | ModuleType | gymnasium.Env):
@@ -83,7 +83,7 @@ def held_by(owner: Any) -> Iterator[Any]:
 
 
 def _parts(values: Iterable[Any]) -> Iterator[Any]:
-    """The values, and the items of those that are lists, tuples or dicts."""
+    """Yield the values, and the items of lists, tuples and dicts among them."""
     for value in list(values):
         yield value
         if isinstance(value, list | tuple):
@@ -93,7 +93,7 @@ def _parts(values: Iterable[Any]) -> Iterator[Any]:
 
 
 def _restorers(env: gymnasium.Env[Any, Any]) -> Iterator[Callable[[], object]]:
-    """For each generator that the environment holds, a function that restores it."""
+    """Yield a function for each generator of the environment that restores it."""
     for owner in _owners(env):
         if isinstance(owner, gymnasium.Env):
             yield from filter(None, map(_restorer, held_by(owner)))
@@ -101,12 +101,12 @@ def _restorers(env: gymnasium.Env[Any, Any]) -> Iterator[Callable[[], object]]:
             restore = _restorer(value)
             if restore is not None:
                 yield restore
-            if restore is not None or name == "_np_random":  # a space's is None until it is used
+            if restore is not None or name == "_np_random":  # None for a space before its first use
                 yield _reassign(owner, name, value)
 
 
 def _owners(env: gymnasium.Env[Any, Any]) -> Iterator[Any]:
-    """Objects whose attributes may be generators of an environment."""
+    """Yield the objects whose attributes may be generators of an environment."""
     layer: Any = env
     while layer is not None:
         yield layer
@@ -118,7 +118,7 @@ def _owners(env: gymnasium.Env[Any, Any]) -> Iterator[Any]:
 
 
 def _with_parts(value: Any) -> Iterator[Any]:
-    """A space and the spaces in it; nothing for any other object."""
+    """Yield a space and the spaces in it; nothing for any other object."""
     if isinstance(value, spaces.Space):
         yield value
         for part in value.spaces.values() if isinstance(value, spaces.Dict) else ():
@@ -126,7 +126,10 @@ def _with_parts(value: Any) -> Iterator[Any]:
 
 
 def _restorer(value: Any) -> Callable[[], object] | None:
-    """A function that sets a generator back to its present state; None for other objects."""
+    """Return a function that restores the present state of a generator.
+
+    Return None for other objects.
+    """
     if isinstance(value, np.random.Generator):
         bits, state = value.bit_generator, value.bit_generator.state
         return lambda: setattr(bits, "state", state)
@@ -143,7 +146,7 @@ def _restorer(value: Any) -> Callable[[], object] | None:
 
 
 def _reassign(owner: Any, name: str, value: Any) -> Callable[[], None]:
-    """A function that makes a generator the owner's again: `reset(seed=...)` may replace it."""
+    """Return a function that assigns a generator again, since `reset` may have replaced it."""
 
     def reassign() -> None:
         if owner.__dict__.get(name) is not value:

@@ -1,4 +1,4 @@
-"""Acting: the stack of frames that an agent sees, and what an episode came to."""
+"""The frame stack for acting, transfers to and from the device, and sums over an episode."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ from merl.core import Observation
 
 
 class FrameStack:
-    """The last frames of every image, for the one who acts.
+    """The last frames of each image, for acting.
 
-    The replay keeps single frames and stacks them itself; this is the same stack at acting time: at
-    an episode's start the first frame is repeated.
+    The replay stores single frames and makes the same stack when sampling. At the start of an
+    episode the first frame is repeated.
+
+    Args:
+        frames: number of frames in a stack, K.
+        images: keys of the images; all other keys are vectors and are not stacked.
+        device: device of the stacked observations.
     """
 
     def __init__(self, frames: int, images: tuple[str, ...], device: torch.device) -> None:
@@ -29,28 +34,28 @@ class FrameStack:
         self._vectors: dict[str, NDArray[Any]] = {}
 
     def reset(self, observation: Observation) -> None:
-        """Begin an episode."""
+        """Start an episode with its first observation."""
         for key, frames in self._frames.items():
             frames.extend([observation[key].copy()] * (self._length - 1))
         self.push(observation)
 
     def push(self, observation: Observation) -> None:
-        """Take in what a step led to."""
+        """Add the observation after a step."""
         for key, frames in self._frames.items():
-            frames.append(observation[key].copy())  # a camera may refill one and the same array
+            frames.append(observation[key].copy())  # an environment may reuse the array
         self._vectors = {k: v for k, v in observation.items() if k not in self._frames}
 
     def observation(self) -> dict[str, torch.Tensor]:
-        """A batch of one: images uint8 (1, K, H, W, C), vectors (1, n)."""
+        """Return a batch of size one: images uint8 (1, K, H, W, C), vectors (1, n)."""
         return side_by_side([self])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The same on the host, without the batch."""
+        """Return the stacked observation as NumPy arrays, without a batch dimension."""
         return {key: np.stack(frames) for key, frames in self._frames.items()} | self._vectors
 
 
 def side_by_side(stacks: Sequence[FrameStack]) -> dict[str, torch.Tensor]:
-    """What several see, as one batch (N, ...) on their device."""
+    """Return the observations of several stacks as one batch (N, ...) on their device."""
     device = stacks[0].device
     seen = [stack.arrays() for stack in stacks]
     return {
@@ -60,52 +65,52 @@ def side_by_side(stacks: Sequence[FrameStack]) -> dict[str, torch.Tensor]:
 
 
 def bring(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
-    """To the device, without waiting for what a GPU is at: that takes pinned memory."""
+    """Copy a tensor to the device without waiting for a GPU, which needs pinned memory."""
     if device.type == "cuda":
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
 
 
 class Fetched:
-    """A tensor on its way to the host.
+    """An asynchronous copy of a tensor to the host.
 
-    Who waits for it waits for nothing that a GPU is given afterwards.
+    `wait` does not wait for GPU work that is queued after this copy.
 
     Attributes:
-        under_way: a GPU has yet to compute it.
+        under_way: the copy from the GPU has not been waited for yet.
     """
 
     def __init__(self, tensor: torch.Tensor) -> None:
         self.under_way = tensor.is_cuda
-        self._there = tensor
+        self._result = tensor
         if self.under_way:
-            self._there = torch.empty(
+            self._result = torch.empty(
                 tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=True
             )
-            self._there.copy_(tensor, non_blocking=True)
+            self._result.copy_(tensor, non_blocking=True)
             self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self._done.record()
 
     def wait(self) -> torch.Tensor:
-        """It, once it is there."""
+        """Wait for the copy and return the tensor on the host."""
         if self.under_way:
             self._done.synchronize()
             self.under_way = False
-        return self._there
+        return self._result
 
 
 @dataclass
 class Episode:
-    """The sums over an episode's steps.
+    """Sums over the steps of an episode.
 
     Attributes:
         total_reward: the undiscounted return.
-        length: steps.
+        length: number of steps.
         success: whether the last step reported success; None if no step reported success or
             failure.
-        reports: how many steps reported success or failure.
-        successes: how many steps reported success.
-        terms: each term of the reward, summed.
+        reports: number of steps that reported success or failure.
+        successes: number of steps that reported success.
+        terms: the sum of each reward term.
     """
 
     total_reward: float = 0.0
@@ -116,7 +121,7 @@ class Episode:
     terms: dict[str, float] = field(default_factory=dict)
 
     def add(self, reward: float, info: Mapping[str, Any]) -> None:
-        """Take in one step."""
+        """Add one step."""
         self.total_reward += reward
         self.length += 1
         if "success" in info:
@@ -130,14 +135,15 @@ class Episode:
 
     @property
     def success_share(self) -> float:
-        """The share of the steps that reported success, of those that reported at all."""
+        """Return the share of successes among the steps that reported success or failure."""
         return self.successes / self.reports if self.reports else 0.0
 
     def metrics(self, *, reports_success: bool = False) -> dict[str, float]:
-        """Its numbers by name.
+        """Return the metrics of the episode by name.
 
         Args:
-            reports_success: the environment reports success, so an episode without a report failed.
+            reports_success: the environment is known to report success, so an episode without a
+                report counts as a failure.
         """
         values = {"return": self.total_reward, "length": float(self.length)}
         if reports_success or self.success is not None:
@@ -150,12 +156,12 @@ class Episode:
 
 
 def report_success(episodes: Sequence[Episode]) -> bool:
-    """Whether any of these episodes has reported success or failure."""
+    """Return whether any of these episodes has reported success or failure."""
     return any(episode.success is not None for episode in episodes)
 
 
 def mean_metrics(episodes: Sequence[Episode], *, reports_success: bool = False) -> dict[str, float]:
-    """The mean of the numbers of episodes that ended at the same step; see `Episode.metrics`."""
+    """Return the mean metrics of episodes that ended at the same step; see `Episode.metrics`."""
     reports_success = reports_success or report_success(episodes)
     each = [episode.metrics(reports_success=reports_success) for episode in episodes]
     return {

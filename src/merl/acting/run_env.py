@@ -1,4 +1,4 @@
-"""The environment of a run: made from its config, and narrowed to what its agent consumes."""
+"""The environment of a run, made from its config, with only the keys that the agent uses."""
 
 from __future__ import annotations
 
@@ -29,12 +29,16 @@ from merl.envs.user_spaces import brief
 
 
 def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
-    """The environment of a run, with fields of its `EnvConfig` (or `render_mode`) changed.
+    """Make the environment of a run.
 
-    It gives what the agent consumes and nothing else: what nobody consumes is never rendered.
+    Its observation has only the keys that the agent uses; other keys are not rendered.
+
+    Args:
+        config: the config of the run.
+        **changes: fields of `EnvConfig` to change, and `render_mode`.
 
     Raises:
-        MerlError: there is no such environment, or it lacks what the agent consumes.
+        MerlError: there is no such environment, or it lacks a key that the agent uses.
     """
     render_mode = changes.pop("render_mode", None)
     env: gymnasium.Env[Any, Any]
@@ -42,8 +46,8 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
         changes.pop("render_size", None)
         if changes:
             raise MerlError(
-                f"{', '.join(changes)} is for merl's own tasks: {config.task} decides for itself "
-                "how it is seen"
+                f"{', '.join(changes)} is for merl's own tasks only: {config.task} sets its own "
+                "observations; leave the option out"
             )
         with handlers_kept():
             env = Supervised(make_user_env(config.task, render_mode, config.user_env))
@@ -63,9 +67,9 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
 
 
 class Supervised(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A user's environment, after each of whose calls the signal handlers are put back.
+    """A wrapper of a user's environment that restores the signal handlers after each call.
 
-    Simulators and drivers install handlers of their own, which would swallow Ctrl-C.
+    Simulators and drivers may install their own handlers, with which Ctrl-C would have no effect.
     """
 
     def reset(
@@ -86,7 +90,7 @@ class Supervised(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self.env.render()
 
     def close(self) -> None:
-        """Close it; Ctrl-C gives up waiting for that, and what follows goes on."""
+        """Close the environment; Ctrl-C stops waiting for it, with a warning."""
         try:
             with handlers_kept():
                 self.env.close()
@@ -95,7 +99,7 @@ class Supervised(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Box]:
-    """What the agent consumes of the observation, and the actions."""
+    """Return the observation keys that the agent uses, with their spaces, and the action space."""
     space = env.observation_space
     assert isinstance(space, spaces.Dict)
     assert isinstance(env.action_space, spaces.Box)
@@ -105,7 +109,7 @@ def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[space
 
 
 def own_bounds(env: gymnasium.Env[Any, Any]) -> tuple[list[float], list[float]] | None:
-    """The bounds of the environment's own actions, lower and upper, where they were rescaled."""
+    """Return lower and upper bounds of the actions before rescaling; None if not rescaled."""
     bounds: tuple[list[float], list[float]] | None = None
     if env.has_wrapper_attr("own_bounds"):
         bounds = env.get_wrapper_attr("own_bounds")
@@ -114,12 +118,12 @@ def own_bounds(env: gymnasium.Env[Any, Any]) -> tuple[list[float], list[float]] 
 
 @dataclass(frozen=True)
 class EnvSpaces:
-    """The spaces by which two instances of an environment are recognised as the same.
+    """The spaces of an environment, to compare two instances of it.
 
     Attributes:
-        observation: what the agent consumes.
-        action: what it does, in [-1, 1].
-        bounds: of the environment's own actions, where they were rescaled.
+        observation: the observation keys that the agent uses.
+        action: the agent's actions, in [-1, 1].
+        bounds: lower and upper bounds of the actions before rescaling; None if not rescaled.
     """
 
     observation: spaces.Dict
@@ -128,29 +132,29 @@ class EnvSpaces:
 
     @classmethod
     def of(cls, config: TrainConfig, env: gymnasium.Env[Any, Any]) -> EnvSpaces:
-        """The spaces of a run's environment."""
+        """Return the spaces of a run's environment."""
         return cls(*run_spaces(config, env), own_bounds(env))
 
     def check(self, other: EnvSpaces, what: str) -> None:
         """Check that another instance has the same spaces.
 
         Args:
-            other: its spaces.
-            what: the other instance, for the message.
+            other: the spaces of the other instance.
+            what: a name of the other instance, for the message.
 
         Raises:
-            MerlError: naming what differs.
+            MerlError: the spaces differ; the message names each difference.
         """
         mine, theirs = self._parts(), other._parts()
         differs = []
         for name in mine | theirs:
             one, two = mine.get(name), theirs.get(name)
             if one != two:
-                differs.append(f"{name} is {_in_words(one)} and {_in_words(two)}")
+                differs.append(f"{name} is {_describe(one)} and {_describe(two)}")
         if differs:
             raise MerlError(
                 f"two instances of the environment differ, the first one and {what}: "
-                f"{'; '.join(differs)}: make all instances alike"
+                f"{'; '.join(differs)}: give all instances the same spaces"
             )
 
     def _parts(self) -> dict[str, Any]:
@@ -160,9 +164,9 @@ class EnvSpaces:
         return parts | {"action": self.action, "the actions' bounds": self.bounds}
 
 
-def _in_words(part: Any) -> str:
+def _describe(part: Any) -> str:
     if part is None:
-        return "not there"
+        return "missing"
     if isinstance(part, spaces.Space):
         return brief(part)
     low, high = part
@@ -170,14 +174,14 @@ def _in_words(part: Any) -> str:
 
 
 def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
-    """Say which observation keys the agent uses, as what, and which it leaves out and why.
+    """Describe which observation keys the agent uses, and which it does not use and why.
 
     Args:
-        config: of the run.
-        env: made by `make_run_env`.
+        config: the config of the run.
+        env: the environment from `make_run_env`.
 
     Returns:
-        A line each for images, vectors, those for the critic alone, and those left out.
+        One line each for images, vectors, privileged vectors and unused keys, where there are any.
     """
     space, _ = run_spaces(config, env)
     images, vectors = modalities(config.agent, space)
@@ -194,7 +198,7 @@ def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
     left_out = {}
     if env.has_wrapper_attr("left_out"):
         for key, given in env.get_wrapper_attr("modalities").items():
-            if key in space.spaces:  # `key in space` would ask whether it is an observation
+            if key in space.spaces:  # `key in space` would test for an observation
                 continue
             kind = "images" if is_image(given.space) else "vectors"
             left_out[key] = f"--agent.{kind} names others"
@@ -217,15 +221,17 @@ def _size(space: spaces.Space[Any]) -> str:
 
 
 def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    """Return the state of the generators that an environment draws from, as plain types.
+    """Return the state of an environment's random generators, as plain types.
+
+    An environment with other generators has different episodes after a resume.
 
     Returns:
         The state of the environment's `np_random` (`bit_generator` is one of its keys), empty if
-        the environment does not use it, and under `globals` that of the process's global
-        generators. An environment with other generators meets other episodes after a resume.
+        the environment does not use it, and under `globals` the state of the global generators of
+        the process.
     """
     state: dict[str, Any] = {}
-    # Gymnasium's `np_random` makes a generator on access; this attribute is one that is in use.
+    # Gymnasium's property `np_random` makes a generator on access; this attribute does not.
     generator = getattr(env.unwrapped, "_np_random", None)
     if isinstance(generator, np.random.Generator):
         state = dict(generator.bit_generator.state)
@@ -247,12 +253,13 @@ def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any]
 
 
 def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
-    """Of what the Jaco environments can give: what the agent names, else what the config has.
+    """Return the observations of a Jaco environment that the agent needs.
 
-    `state`, which no robot could measure, has to be named.
+    These are the keys that the agent names; if it names none, those of the config. `state` is used
+    only if it is named, since a real robot cannot measure it.
 
     Raises:
-        MerlError: nothing but `state` is left, and it is not named.
+        MerlError: only `state` is left, and the agent does not name it.
     """
     images, vectors = agent.images, agent.vectors
     default = [
@@ -261,12 +268,12 @@ def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
         if (images is None if name == "image" else vectors is None and name != "state")
     ]
     named = {*(images or ()), *(vectors or ()), *agent.privileged}
-    if not named <= set(OBSERVATIONS):  # the agent's check says which there are
+    if not named <= set(OBSERVATIONS):  # the check of the agent config reports this
         return OBSERVATIONS
     asked = [name for name in OBSERVATIONS if name in named or name in default]
     if not asked and vectors is None and "state" in env.observations:
         raise MerlError(
-            f"the agent finds nothing to sense among {sorted(env.observations)}: name it with "
-            "--agent.vectors state, or take --agent merl_state, ddpg or sac"
+            f"the agent can use no observation among {sorted(env.observations)}: add "
+            "--agent.vectors state, or use --agent merl_state, ddpg or sac"
         )
     return tuple(asked) or env.observations

@@ -1,4 +1,4 @@
-"""The agents: one learner (`ddpg`), and each agent a choice of values for it (`config`)."""
+"""The agents: one learner (`ddpg`); each agent is a choice of values for it (`config`)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ AGENTS: dict[str, AgentConfig] = {
     "drqv2": DrQV2Config(),
     "ddpg": DDPGConfig(),
     "sac": SACConfig(),
-    # What the paper's argument needs beside its four: the joints alone, and MERL on the state.
+    # Two baselines of the paper's argument: proprioception alone, and MERL on the state.
     "proprio": MERLConfig(images=()),
     "merl_state": MERLConfig(images=(), vectors=("state",)),
 }
-"""The agents by name."""
+"""Default config of each agent, by name."""
 
 
 def make_agent(
@@ -36,19 +36,20 @@ def make_agent(
     device: torch.device,
     threads: int | None = None,
 ) -> DDPG:
-    """Make the agent of a config for these spaces.
+    """Build the agent of a config for these spaces.
 
     Args:
-        config: what it is made of.
-        observation_space: what the environment gives.
-        action_space: what it takes, (A,).
-        frame_stack: frames of an image that the agent sees at once.
-        seed: of its weights, noise and shifts.
-        device: where it lives.
-        threads: processor threads of acting and updates; None: as torch is set.
+        config: config of the agent.
+        observation_space: observations of the environment.
+        action_space: actions of the environment, (A,).
+        frame_stack: number of frames in an image stack.
+        seed: seed of weights, noise and shifts.
+        device: device of the agent.
+        threads: CPU threads of acting and updates; None keeps torch's setting.
 
     Raises:
-        MerlError: the observation lacks what the agent consumes, or the config does not fit it.
+        MerlError: the observation space lacks a key that the agent uses, or the config does not fit
+            the space.
     """
     actor = GaussianActor if isinstance(config, SACConfig) else Actor
     with torch_settings(device, threads):

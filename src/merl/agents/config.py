@@ -1,4 +1,4 @@
-"""What an agent is made of and how it learns, as values: every agent is a choice of these."""
+"""Config of an agent: its networks and how it learns. Each agent is a choice of these values."""
 
 from __future__ import annotations
 
@@ -18,89 +18,90 @@ FusionOwner = Literal["decoupled", "shared", "shared_by_both"]
 TorchCompile = Literal["auto", "yes", "no"]
 
 WIDEST = 65_536
-"""More than any layer here has ever been given."""
+"""Upper bound of layer widths and other counts in the config."""
 
 
 @dataclass(frozen=True)
 class AgentConfig:
-    """What an agent is made of and how it learns; the values are Table 1's and Appendix C.1's."""
+    """Networks of an agent and how it learns; the defaults are from Table 1 and Appendix C.1."""
 
     images: tuple[str, ...] | None = None
-    """Image keys to see; every one that the environment gives, if not set."""
+    """Image keys to use; if not set, every image that the environment gives."""
     vectors: tuple[str, ...] | None = None
-    """Vector keys to feel; if not set, every one that the environment gives and that is not for the
-    critic alone. Of merl's own tasks `state` is used only if it is named."""
+    """Vector keys to use; if not set, every vector that the environment gives, except the
+    privileged ones. In merl's own tasks, `state` is used only if it is named."""
     privileged: tuple[str, ...] = ()
-    """Vector keys that the critic alone is told, e.g. `state`: what is known in training only."""
+    """Vector keys that only the critic observes, e.g. `state`: known in training only (asymmetric
+    critic)."""
     learning_rate: float = 1e-4
-    """Adam's step size, for every network."""
+    """Step size of Adam, for every network."""
     critic_loss: CriticLoss = "mse"
-    """How the critic learns its target: by the mean squared error, or as a histogram over bins by
-    cross-entropy (hl_gauss; Farebrother et al. 2024)."""
+    """Loss of the critic: the mean squared error (mse), or the cross-entropy of a histogram of
+    returns (hl_gauss; Farebrother et al. 2024)."""
     critic_bins: int = 101
-    """Bins of that histogram, the three beyond each bound included."""
+    """Bins of the histogram, including three beyond each bound."""
     critic_low: float = 0.0
-    """The lowest return that the histogram can hold, in the unit of the rewards. Lower targets
-    count as this one: with rewards below 0 set it."""
+    """Lowest return of the histogram, in units of reward. Lower targets are clipped to it: set it
+    if rewards can be below 0."""
     critic_high: float | None = None
-    """The highest; if not set, 1 / (1 - discount), which no return exceeds as long as rewards lie
-    in [0, 1]. Higher targets count as this one: with rewards above 1 set it."""
+    """Highest return of the histogram; if not set, 1 / (1 - discount), the bound for rewards in
+    [0, 1]. Higher targets are clipped to it: set it if rewards can be above 1."""
     actor_every: int = 1
-    """The actor learns in every n-th update only (delayed policy updates, TD3); critic, encoders
-    and target learn in all."""
+    """Update the actor only in every n-th update (delayed policy updates, TD3); critic, encoders
+    and target are updated every time."""
     actor_average: float | None = None
-    """Evaluate and deploy an exponential moving average of the actor and its fusion, which moves by
-    this share towards the newest weights whenever the actor learns, in (0, 1], e.g. 0.001; if not
-    set, the newest weights. Exploration and updates always use the newest."""
+    """Evaluate and deploy an exponential moving average of the actor and its fusion. This is the
+    weight of the newest weights at each update of the actor, in (0, 1], e.g. 0.001; if not set,
+    there is no average. Exploration and updates always use the newest weights."""
     tau: float = 0.01
-    """How far the target network moves towards the critic at each update, in (0, 1]."""
+    """Weight of the critic in the target network's moving average at each update, in (0, 1]."""
     noise_std: float = 0.2
-    """Standard deviation of the exploration noise, also used in both updates."""
+    """Standard deviation of the exploration noise, also used in updates of critic and actor."""
     noise_std_end: float | None = None
-    """What it falls to, in a straight line over `noise_steps`; it stays as it is, if not set."""
+    """Final standard deviation, reached linearly over `noise_steps`; if not set, it is constant."""
     noise_steps: int = 500_000
-    """Environment steps over which it falls."""
+    """Environment steps over which the standard deviation changes."""
     noise_correlation: float = 0.0
-    """How much of the exploration noise stays from one action to the next, in [0, 1); its standard
-    deviation is the same. In updates the noise is drawn anew."""
+    """Correlation of the exploration noise between consecutive actions, in [0, 1). Its standard
+    deviation does not change. In updates the noise is uncorrelated."""
     noise_clip: float = 0.3
-    """Bound of the noise in both updates; when acting it is not clipped."""
+    """Bound of the noise in the updates of critic and actor; when acting, noise is not clipped."""
     target: Target = "heads"
-    """What has an averaged copy: the Q-heads (MERL), or the critic's fusion too, as DrQ-v2's target
-    covers its trunk."""
+    """Networks that have a target copy: the Q-heads (MERL), or the critic's fusion too, as DrQ-v2's
+    target includes its trunk."""
     latent_dim: int = 128
-    """d, the length of the fused representation: an equal share for each modality, rounded down; 0
-    leaves the fusion out: the encodings go to the heads as they are."""
+    """d, the length of the fused representation: an equal share for each modality, rounded down. 0
+    disables the fusion: the heads receive the concatenated encodings."""
     fusion: FusionOwner = "decoupled"
-    """Whose the fusion is (Figure 3a): one each for critic and actor, or one that both use, which
-    the critic's loss moves, or both losses."""
+    """Fusions of critic and actor (Figure 3a): one each (decoupled), or one for both, trained by
+    the critic's loss (shared) or by both losses (shared_by_both)."""
     fusion_norm: bool = True
     """LayerNorm in the fusion (Figure 3c)."""
     squash: Squash = "tanh"
-    """What bounds the fused representation: tanh, or a softmax over groups of eight."""
+    """Bound of the fused representation: tanh, or a softmax over groups of eight (simnorm)."""
     shift_pad: int = 4
-    """Random shift: how many pixels to each side."""
+    """Random shift, in pixels to each side; 0 disables it."""
     conv_channels: int = 32
-    """Channels of each of the image encoder's convolutions."""
+    """Channels of each convolution of the image encoder."""
     conv_strides: tuple[int, ...] = (2, 1, 1, 1)
     """Strides of the image encoder's convolutions."""
     vector_encoder_dim: int = 0
-    """Width of the MLP that encodes each vector; 0 is the identity (Figure 5)."""
+    """Width of the MLP that encodes each vector; 0 disables the MLP (Figure 5)."""
     standardize: bool = False
-    """Bring the numbers of a vector to one scale, by the mean and the deviation of the first
-    batches; the paper takes them as they are."""
+    """Standardise each vector by the mean and the deviation of the first batches; the paper uses
+    raw vectors."""
     head_layers: int = 3
-    """Linear layers of actor and critic, the output layer counted (paper: 3 for reach, else 6)."""
+    """Linear layers of actor and critic, with the output layer (paper: 3 for reach, else 6)."""
     hidden_dim: int = 1024
     """Width of the hidden layers of actor and critic."""
     head_norm: bool = True
     """LayerNorm in the hidden layers of actor and critic."""
     precision: Precision = "auto"
     """Arithmetic of the update: fp32, bf16 (weights, norms, targets and losses stay fp32), or auto,
-    which times both once."""
+    which times both once and chooses."""
     torch_compile: TorchCompile = "auto"
-    """Whether torch compiles what updates compute, which takes a minute or two: yes, no, or auto,
-    which tries it once on a GPU, for a run that takes long, and keeps it where it is faster."""
+    """Whether to compile the update with torch, which takes a minute or two: yes, no, or auto,
+    which tries it once on a GPU in a long run, and keeps it if it is faster."""
 
     def __post_init__(self) -> None:
         if not 0 < self.learning_rate < math.inf:
@@ -140,17 +141,17 @@ class AgentConfig:
         for name in ("fusion", "fusion_norm", "squash"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):
                 raise MerlError(
-                    f"agent.{_flag(name)} {getattr(self, name)} is of a fusion, and with "
-                    "agent.latent-dim 0 there is none: leave it out, or give a latent-dim"
+                    f"agent.{_flag(name)} {getattr(self, name)} is an option of the fusion, "
+                    "which agent.latent-dim 0 disables: remove it, or set a latent-dim above 0"
                 )
         if not self.conv_strides or min(self.conv_strides) < 1:
             raise MerlError(
-                f"agent.conv-strides {self.conv_strides} must name a stride of at least 1 for each "
-                "convolution"
+                f"agent.conv-strides {self.conv_strides} must give a stride of at least 1 for each "
+                "convolution, and at least one convolution"
             )
 
     def _given(self, *names: str) -> Iterator[tuple[str, float]]:
-        """Those of these fields that are set, with their values."""
+        """Yield the named fields that are set, with their values."""
         return ((name, value) for name in names if (value := getattr(self, name)) is not None)
 
     def _check_histogram(self) -> None:
@@ -158,8 +159,8 @@ class AgentConfig:
             value = getattr(self, name)
             if self.critic_loss == "mse" and value != getattr(AgentConfig, name):
                 raise MerlError(
-                    f"agent.{_flag(name)} {value} is of a histogram, and agent.critic-loss mse "
-                    "has none: leave it out, or use --agent.critic-loss hl_gauss"
+                    f"agent.{_flag(name)} {value} is an option of the histogram, and "
+                    "agent.critic-loss mse has none: remove it, or use --agent.critic-loss hl_gauss"
                 )
             if value is not None and not math.isfinite(value):
                 raise MerlError(f"agent.{_flag(name)} must be finite, not {value}")
@@ -170,7 +171,7 @@ class AgentConfig:
             )
 
     def noise(self, step: int) -> float:
-        """The standard deviation of the exploration noise after `step` environment steps."""
+        """Return the exploration noise's standard deviation after `step` environment steps."""
         if self.noise_std_end is None:
             return self.noise_std
         share = min(step / self.noise_steps, 1.0)

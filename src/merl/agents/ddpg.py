@@ -1,10 +1,10 @@
 """The learner: DDPG with n-step returns and clipped double Q (MERL 4.2, Algorithm 1; DrQ-v2).
 
-What is learnt from is a batch of (o_t, a_t, r_{t:t+n-1}, o_{t+n}); what an agent makes of its
-observations is the business of the networks that it declares. The methods below read beside
-Algorithm 1: `update_critic`, `update_actor`, `update_target`.
+An update learns from a batch of (o_t, a_t, r_{t:t+n-1}, o_{t+n}); the agent's networks represent
+the observations. The methods `update_critic`, `update_actor` and `update_target` follow
+Algorithm 1.
 
-Agent `ddpg` is this learner on the state, as it is (docs/agents/ddpg.md).
+Agent `ddpg` is this learner on the state, without changes (docs/agents/ddpg.md).
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ class DDPGConfig(AgentConfig):
     """DDPG on the state, with clipped double Q (Fujimoto et al. 2018) and 3-step returns."""
 
     images: tuple[str, ...] | None = ()
-    """Image keys to see: none."""
+    """Image keys to use: none."""
     vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to feel."""
+    """Vector keys to use."""
     latent_dim: int = 0
-    """d, the length of a fused representation; 0 is none: the state goes to the heads as it is."""
+    """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
     head_norm: bool = False
     """LayerNorm in the hidden layers of actor and critic."""
 
 
 class DDPG:
-    """The off-policy actor-critic of the paper.
+    """Off-policy actor-critic of the paper.
 
     Args:
-        networks: freshly initialised; moved to `device`.
-        config: how to learn; `precision` "auto" counts as fp32 here, `torch_compile` "auto" as no.
-        seed: of the noise and the shifts.
-        device: where everything lives.
-        threads: processor threads of acting and updates; None: as torch is set.
+        networks: freshly initialised networks; moved to `device`.
+        config: how to learn; `precision` "auto" means fp32 here, `torch_compile` "auto" means no.
+        seed: seed of the noise and the shifts.
+        device: device of the networks, the optimizers and the random generators.
+        threads: CPU threads of acting and updates; None keeps torch's setting.
 
     Attributes:
-        step: environment steps so far, which the noise may depend on; set by who drives it.
-        sigma: the standard deviation of the noise in updates, where it is kept on the device, as a
-            CUDA graph must read it; None: as the config has it for `step`.
-        updates: critic updates so far, which decide when the actor learns.
+        step: environment steps so far, on which the noise may depend; set by the caller.
+        sigma: standard deviation of the noise in updates as a tensor on the device, from which a
+            CUDA graph reads it; None: computed from the config and `step`.
+        updates: critic updates so far; they determine when the actor is updated.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class DDPG:
         self.config = config
         self.device, self.threads = device, threads
         self.networks = networks.to(device)
-        # The target fuses with the most recent weights unless its config averages them too.
+        # The target uses the newest fusion, unless the config gives the fusion a target too.
         self.critic_target = nn.ModuleDict(copy.deepcopy(self._averaged())).requires_grad_(False)
         parts = networks.encoders, networks.critic_fusion, networks.critic
         self.critic_parameters = [parameter for part in parts for parameter in part.parameters()]
@@ -93,7 +93,7 @@ class DDPG:
 
     @property
     def senses(self) -> tuple[str, ...]:
-        """The keys of an observation that it acts on."""
+        """Observation keys that the actor uses."""
         return self.networks.senses
 
     # Acting ---------------------------------------------------------------------------------
@@ -101,11 +101,13 @@ class DDPG:
     @with_torch_settings
     @torch.inference_mode()
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
-        """a_t = pi(h_actor(f(o_image), g(o_prop))) + epsilon, epsilon ~ N(0, sigma^2) not clipped.
+        """Compute a_t = pi(h_actor(f(o_image), g(o_prop))) + epsilon, epsilon ~ N(0, sigma^2).
+
+        The noise is not clipped.
 
         Args:
             observation: images uint8 (B, K, H, W, C), vectors float32 (B, n), on the device.
-            explore: add the noise; without, the actor's average acts where one is kept.
+            explore: add the noise; if False, the averaged actor acts, if there is one.
 
         Returns:
             Actions (B, A), in [-1, 1].
@@ -125,16 +127,16 @@ class DDPG:
 
     @property
     def actor_is_due(self) -> bool:
-        """Whether the actor learns in the next update: the last one of every `actor_every`."""
+        """Whether the next update trains the actor: the last of every `actor_every` updates."""
         return (self.updates + 1) % self.config.actor_every == 0
 
     def update(self, batch: Batch) -> dict[str, Tensor]:
-        """Draw noise and shifts, then `learn` from the batch."""
+        """Draw noise and shifts, and call `learn` with the batch and these."""
         return self.learn(batch.to(self.device), self.draw(len(batch.action)))
 
     @with_torch_settings
     def learn(self, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
-        """Augment and encode; then one step of the critic, of the actor if due, of the target."""
+        """Augment and encode the batch; update the critic, the actor if due, and the target."""
         encoders = self.networks.encoders
         encoders.observe(batch.observation)
         with self._arithmetic():
@@ -143,7 +145,7 @@ class DDPG:
                 next_encoded = encoders(batch.next_observation, draws.next_shifts)
         metrics = self.update_critic(encoded, next_encoded, batch, draws.next_noise)
         if self.actor_is_due:
-            # The encoders' features of o_t serve again, from before the critic's step and detached.
+            # Reuse the features of o_t from before the critic's step, without gradient.
             encoded = {key: features.detach() for key, features in encoded.items()}
             metrics |= self.update_actor(encoded, draws.actor_noise)
             if self.config.actor_average is not None:
@@ -159,9 +161,9 @@ class DDPG:
         batch: Batch,
         next_noise: Tensor,
     ) -> dict[str, Tensor]:
-        """Eq. 1: both Q-functions towards y; encoders and the critic's fusion learn with them."""
+        """Move both Q-functions, the critic's fusion and the encoders towards y (Eq. 1)."""
         networks = self.networks
-        # Apart: autocast would hand weights that it cast without a gradient to what needs one.
+        # Separate blocks: autocast would reuse weights that it cast without gradient.
         with self._arithmetic(), torch.no_grad():
             next_action, bonus = self.next_action(next_encoded, next_noise)
             next_q = self.target_q(next_encoded, next_action)
@@ -183,12 +185,12 @@ class DDPG:
     def next_action(
         self, next_encoded: Mapping[str, Tensor], noise: Tensor
     ) -> tuple[Tensor, Tensor | float]:
-        """pi(o_{t+n}) + epsilon, (B, A), and what is added to its value: nothing."""
+        """Return pi(o_{t+n}) + epsilon, (B, A), and the bonus added to its value: 0."""
         action = self.networks.actor(self.networks.actor_latent(next_encoded)) + noise
         return action.clamp(-1.0, 1.0), 0.0
 
     def target_q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
-        """The lesser of the averaged critic's two values, (B,)."""
+        """Return the smaller of the target critic's two values, (B,)."""
         latent = self._target_part("critic_fusion")(encoded)
         critic = self._target_part("critic")
         assert isinstance(critic, TwinCritic)
@@ -196,7 +198,7 @@ class DDPG:
         return torch.minimum(q1, q2)
 
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
-        """Eq. 2: the actor and its fusion towards actions of higher value; nothing else moves."""
+        """Move only the actor and its fusion towards actions of higher value (Eq. 2)."""
         with self._arithmetic():
             mean = self.networks.actor(self.networks.actor_latent(encoded))  # (B, A)
             loss = -self.q(encoded, clamp_straight_through(mean + noise)).mean()
@@ -207,7 +209,7 @@ class DDPG:
         }
 
     def q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
-        """min_k Q_phi_k(o_t, a), (B,), as a function of the action alone."""
+        """Return min_k Q_phi_k(o_t, a), (B,), differentiable in the action alone."""
         with torch.no_grad():
             latent = self.networks.critic_fusion(encoded)
         with frozen(self.networks.critic):
@@ -216,14 +218,14 @@ class DDPG:
 
     @torch.no_grad()
     def update_target(self) -> None:
-        """phi_bar <- (1 - tau) phi_bar + tau phi."""
+        """Update the target: phi_bar <- (1 - tau) phi_bar + tau phi."""
         average: list[Tensor] = list(self.critic_target.parameters())
         recent: list[Tensor] = [p for part in self._averaged().values() for p in part.parameters()]
         torch._foreach_lerp_(average, recent, self.config.tau)
 
     @with_torch_settings
     def draw(self, size: int) -> UpdateNoise:
-        """The random numbers of the next update, from a batch of so many samples."""
+        """Draw the random numbers of the next update, for a batch of `size` samples."""
         generator = self.learning
         pad, shape = self.networks.encoders.pad, (size, self.networks.actor.action_dim)
         keys = self.networks.encoders.image_keys if pad else ()
@@ -237,7 +239,7 @@ class DDPG:
         return UpdateNoise(shifts, next_shifts, next_noise, noise)
 
     def copies(self, draws: UpdateNoise) -> tuple[FrameTransforms, FrameTransforms]:
-        """The draws' shifts of o_t and o_{t+n}, for a replay that applies them when it samples."""
+        """Return the shifts of o_t and o_{t+n} as frame transforms, which replay applies."""
         pad = self.networks.encoders.pad
         now, then = (
             {key: RandomShift(shifts, pad) for key, shifts in each.items()}
@@ -246,7 +248,7 @@ class DDPG:
         return now, then
 
     def epsilon(self, noise: Tensor) -> Tensor:
-        """Standard normal numbers to the noise of an update: clip(N(0, sigma^2), -c, c)."""
+        """Scale standard normal numbers to the noise of an update: clip(N(0, sigma^2), -c, c)."""
         clip = self.config.noise_clip
         sigma = self.config.noise(self.step) if self.sigma is None else self.sigma
         return noise.mul_(sigma).clamp_(-clip, clip)
@@ -254,7 +256,7 @@ class DDPG:
     # Saving ---------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next update and the next action depend on."""
+        """Return everything that the next update and the next action depend on."""
         return {
             "networks": self.networks.state_dict(),
             "critic_target": self.critic_target.state_dict(),
@@ -268,58 +270,58 @@ class DDPG:
 
     @with_torch_settings
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state_dict` gave."""
+        """Restore from `state_dict()`."""
         self.networks.load_state_dict(state["networks"])
         self.critic_target.load_state_dict(state["critic_target"])
         noise = state.get("acting_noise")
         self.acting_noise = None if noise is None else noise.to(self.device)
         load_optimizer(self.critic_optimizer, state["critic_optimizer"])
         load_optimizer(self.actor_optimizer, state["actor_optimizer"])
-        self.updates = state.get("updates", 0)  # checkpoints before `actor_every` have none
+        self.updates = state.get("updates", 0)  # older checkpoints have none
         for name in ("acting", "learning"):
             generator: torch.Generator = getattr(self, name)
-            # A CPU's generator and CUDA's have states of other kinds: on another device than the
-            # one that was saved on, the noise starts anew.
+            # The generators of CPU and CUDA have different states: on another kind of device than
+            # the saved one, the noise restarts from the seed.
             if state[name].shape == generator.get_state().shape:
                 generator.set_state(state[name].cpu())
 
     # ----------------------------------------------------------------------------------------
 
     def _policy(self, observation: Mapping[str, Tensor], *, averaged: bool) -> Any:
-        """What the actor makes of what it senses; what only the critic is told may be absent."""
+        """Return the actor's output; privileged keys may be missing in the observation."""
         networks = self.networks
         sensed = {key: observation[key] for key in networks.senses}
-        # As it is written: batches of acting come in sizes that would each have to be compiled.
+        # Eagerly: each batch size of acting would need another compilation.
         compiled = self.config.torch_compile == "yes"
         with torch.compiler.set_stance("force_eager") if compiled else nullcontext():
             return networks.policy(networks.encoders(sensed), averaged=averaged)
 
     def _actors_fusion(self) -> Iterator[nn.Parameter]:
-        """The fusion that the actor's loss moves: its own, or by name the critic's too."""
+        """Yield the fusion weights that the actor's loss trains: its own, or the shared ones."""
         if self.networks.actor_fusion is not None:
             yield from self.networks.actor_fusion.parameters()
         elif self.config.fusion == "shared_by_both":
             yield from self.networks.critic_fusion.parameters()
 
     def _target_part(self, name: str) -> nn.Module:
-        """The averaged copy of a network, or the network itself where none is kept."""
+        """Return the target copy of a network, or the network itself if it has none."""
         kept = name in self.critic_target
         part: nn.Module = self.critic_target[name] if kept else getattr(self.networks, name)
         return part
 
     def _averaged(self) -> dict[str, nn.Module]:
-        """What the target network is an average of."""
+        """Return the networks that have a target copy."""
         parts: dict[str, nn.Module] = {"critic": self.networks.critic}
         if self.config.target == "heads_and_fusion":
             parts["critic_fusion"] = self.networks.critic_fusion
         return parts
 
     def _arithmetic(self) -> AbstractContextManager[Any]:
-        """Autocast to bf16 where that was chosen."""
+        """Return a context with autocast to bf16, enabled if the config chooses bf16."""
         enabled = self.config.precision == "bf16"
         return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled)
 
     def _adam(self, parameters: Sequence[Tensor]) -> torch.optim.Adam:
-        """Adam over these parameters, with the config's step size."""
-        on_a_card = self.device.type == "cuda"  # its graphs read the step from the device
-        return adam(parameters, self.config.learning_rate, capturable=on_a_card)
+        """Make Adam for these parameters, with the config's step size."""
+        on_gpu = self.device.type == "cuda"  # CUDA graphs read the step from the device
+        return adam(parameters, self.config.learning_rate, capturable=on_gpu)

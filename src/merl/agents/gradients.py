@@ -1,4 +1,4 @@
-"""Where gradients go: past a clamp, and not into weights that a loss must not move."""
+"""Control of gradients: through a clamp, and not into frozen weights."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 @contextmanager
 def frozen(module: nn.Module) -> Iterator[None]:
-    """No gradient of the module's weights: compiled code would take it, asked for or not."""
+    """Disable the gradients of the module's weights, which compiled code would always compute."""
     weights = [weight for weight in module.parameters() if weight.requires_grad]
     for weight in weights:
         weight.requires_grad_(False)
@@ -22,5 +22,5 @@ def frozen(module: nn.Module) -> Iterator[None]:
 
 
 def clamp_straight_through(action: Tensor) -> Tensor:
-    """The action in [-1, 1], with the gradient as if it had not been clamped."""
+    """Clamp the action to [-1, 1], with the gradient of the unclamped action."""
     return action + (action.clamp(-1.0, 1.0) - action).detach()

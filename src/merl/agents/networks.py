@@ -1,4 +1,4 @@
-"""An agent's networks: what its config declares, built for the senses that an environment gives."""
+"""Networks of an agent, built from its config for an environment's observations."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from merl.networks.representation import Encoders
 from merl.networks.returns import HLGauss, Returns, Scalar
 
 DEFAULT_HIGH = 100.0
-"""The highest return of rewards in [0, 1] with a discount of 0.99."""
+"""Highest return for rewards in [0, 1] and a discount of 0.99."""
 LEAST_SHARE = 2
-"""Numbers of the fused representation that a modality must have."""
+"""Minimum length of a modality's part of the fused representation."""
 
 
 class Networks(nn.Module):
-    """The parametric networks of Algorithm 1, without the targets.
+    """Networks of Algorithm 1, without the targets.
 
     Attributes:
-        encoders: f_xi and g_zeta, learnt by the critic's loss.
+        encoders: f_xi and g_zeta, trained by the critic's loss.
         critic_fusion: h_psi of the critic.
         critic: Q_phi1 and Q_phi2.
-        actor_fusion: h_psi of the actor; None where it uses the critic's.
+        actor_fusion: h_psi of the actor; None if the actor uses the critic's.
         actor: pi_theta.
-        policy_average: an average of the actor and its fusion, which acts in evaluation and
-            deployment; None where the newest weights do.
+        policy_average: moving average of the actor and its fusion, which acts in evaluation and
+            deployment; None if the newest weights act.
     """
 
     def __init__(
@@ -57,33 +57,33 @@ class Networks(nn.Module):
 
     @property
     def senses(self) -> tuple[str, ...]:
-        """The keys that the actor acts on."""
+        """Observation keys that the actor uses."""
         return self._fusion_of_actor().modalities
 
     def actor_latent(self, encoded: Mapping[str, Tensor]) -> Tensor:
-        """What the actor sees: the encodings, fused."""
+        """Fuse the encodings for the actor."""
         latent: Tensor = self._fusion_of_actor()(encoded)
         return latent
 
     def policy(self, encoded: Mapping[str, Tensor], *, averaged: bool = False) -> Any:
-        """What the actor makes of the encodings.
+        """Compute the actor's output from the encodings.
 
         Args:
             encoded: {key: (B, F_key)}.
-            averaged: use the average of its weights, where one is kept.
+            averaged: use the averaged weights, if there are any.
         """
         if averaged and self.policy_average is not None:
             return self.policy_average["actor"](self.policy_average["fusion"](encoded))
         return self.actor(self.actor_latent(encoded))
 
     def start_average(self) -> None:
-        """Keep an average of the actor and its fusion from now on, equal to them so far."""
+        """Start the moving average of the actor and its fusion, as a copy of them."""
         recent = nn.ModuleDict({"fusion": self._fusion_of_actor(), "actor": self.actor})
         self.policy_average = copy.deepcopy(recent).requires_grad_(False)
 
     @torch.no_grad()
     def update_average(self, tau: float) -> None:
-        """Move the average towards the newest weights by the share `tau`."""
+        """Update the moving average with weight `tau` for the newest weights."""
         assert self.policy_average is not None
         average: list[Tensor] = list(self.policy_average.parameters())
         recent: list[Tensor] = [*self._fusion_of_actor().parameters(), *self.actor.parameters()]
@@ -100,17 +100,17 @@ def make_networks(
     stack: int,
     actor: type[Actor] | type[GaussianActor] = Actor,
 ) -> Networks:
-    """Build and initialise an agent's networks (from torch's global seed).
+    """Build and initialise an agent's networks, with torch's global random generator.
 
     Args:
-        config: what they are made of.
-        space: what the environment gives.
+        config: config of the agent.
+        space: observation space of the environment.
         action_dim: A.
-        stack: frames of an image that are seen at once.
-        actor: the kind of policy.
+        stack: number of frames in an image stack.
+        actor: class of the actor.
 
     Raises:
-        MerlError: the space lacks what the agent consumes, or the config does not fit it.
+        MerlError: the space lacks a key that the agent uses, or the config does not fit the space.
     """
     images, vectors = modalities(config, space)
     encoders = Encoders(
@@ -140,10 +140,10 @@ def make_networks(
 
 
 def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The image keys and the vector keys that the agent acts on, checked against the space.
+    """Return the image keys and the vector keys that the actor uses, checked against the space.
 
     Raises:
-        MerlError: naming the key that is missing, and how to get it.
+        MerlError: a named key is missing, or no key is left; the message gives the way out.
     """
     images = _keys("images", config.images, [k for k, s in space.items() if is_image(s)])
     given = [k for k, s in space.items() if is_vector(s)]
@@ -154,45 +154,50 @@ def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...]
             hint = "name some with --agent.images or --agent.vectors"
         elif config.vectors == ():
             others = "merl_state, ddpg or sac" if given == ["state"] else "proprio"
-            hint = f"it needs an image, a uint8 box (H, W, C), or take --agent {others}"
+            hint = f"add an image, a uint8 Box (H, W, C), or use --agent {others}"
         elif given:
-            hint = "--agent.privileged leaves the actor nothing"
+            hint = "--agent.privileged leaves no vector for the actor"
         elif config.images == ():
-            hint = "it needs a vector, a box of n numbers, or take --agent drqv2"
+            hint = "add a vector, a float Box (n,), or use --agent drqv2"
         else:
-            hint = "an image is a uint8 box (H, W, C), a vector a float box (n,)"
-        raise MerlError(f"the agent finds nothing to sense among {sorted(space)}: {hint}")
+            hint = "an image is a uint8 Box (H, W, C), a vector is a float Box (n,)"
+        raise MerlError(f"the agent can use no observation among {sorted(space)}: {hint}")
     return images, vectors
 
 
 def privileged_keys(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
-    """The vector keys that the critic has beyond the actor's.
+    """Return the vector keys that only the critic observes.
 
     Raises:
-        MerlError: a key is missing, is the actor's too, or the fusion is shared.
+        MerlError: a key is missing, the actor uses it too, or the fusion is shared.
     """
     given = [k for k, s in space.items() if is_vector(s)]
     keys = _keys("privileged", config.privileged, given)
     _, vectors = modalities(config, space)
     for key in keys:
         if key in vectors:
-            raise MerlError(f"agent.privileged names {key!r}, which the actor has already")
+            raise MerlError(
+                f"agent.privileged names {key!r}, which the actor uses too: remove it from "
+                "--agent.privileged or from --agent.vectors"
+            )
     if keys and config.fusion != "decoupled":
         raise MerlError(
-            f"agent.privileged {keys} needs a fusion of the critic's own: use --agent.fusion "
-            f"decoupled in place of {config.fusion}"
+            f"agent.privileged {keys} needs separate fusions for critic and actor: use "
+            f"--agent.fusion decoupled instead of {config.fusion}"
         )
     return keys
 
 
 def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
-    """What each modality has of d, rounded down; with an informed critic, what the actor's have.
+    """Return the length of each modality's part of d, rounded down.
+
+    d is divided among the actor's modalities; each privileged key adds a part of the same length.
 
     Raises:
-        MerlError: d is too small for so many, or for the groups of `simnorm`.
+        MerlError: d is too small for these modalities, or does not fit the groups of `simnorm`.
     """
     share = config.latent_dim // len(senses)
-    # Of a single number LayerNorm leaves nothing.
+    # LayerNorm would make a single number constant.
     if config.latent_dim and share < LEAST_SHARE:
         raise MerlError(
             f"agent.latent-dim {config.latent_dim} leaves {share} for each of {len(senses)} "
@@ -207,7 +212,7 @@ def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
 
 
 def _returns(config: AgentConfig) -> Returns:
-    """The form of the critic's output."""
+    """Return the representation of the return by the critic's output."""
     if config.critic_loss == "mse":
         return Scalar()
     high = DEFAULT_HIGH if config.critic_high is None else config.critic_high
@@ -215,7 +220,7 @@ def _returns(config: AgentConfig) -> Returns:
 
 
 def _fusion(config: AgentConfig, features: Mapping[str, int], share: int) -> Fusion | Concatenation:
-    """For these modalities, so many numbers each."""
+    """Build a fusion with `share` numbers per modality; 0: a concatenation."""
     if share == 0:
         return Concatenation(features)
     return Fusion(features, share, config.fusion_norm, config.squash)
@@ -228,8 +233,8 @@ def _image_encoder(
     height, width, channels = space.shape
     if config.shift_pad >= min(height, width):
         raise MerlError(
-            f"agent.shift-pad {config.shift_pad} moves a picture of {height}x{width} pixels out of "
-            f"sight: give at most {min(height, width) - 1}"
+            f"agent.shift-pad {config.shift_pad} is too large for an image of {height}x{width} "
+            f"pixels: use at most {min(height, width) - 1}"
         )
     try:
         return ConvEncoder(
@@ -255,11 +260,11 @@ def _keys(
         return tuple(given if default is None else default)
     for key in chosen:
         if chosen.count(key) > 1:
-            raise MerlError(f"agent.{kind} names {key!r} twice: once is enough")
+            raise MerlError(f"agent.{kind} names {key!r} twice: name it once")
         if key not in given:
             there = f"gives {given}" if given else f"gives no {kind.split('-')[-1]}"
             raise MerlError(
-                f"agent.{kind} names {key!r}, but the environment {there}: name what there is with "
-                f"--agent.{kind}, or have it give {key!r}"
+                f"agent.{kind} names {key!r}, but the environment {there}: name an existing key "
+                f"with --agent.{kind}, or add {key!r} to the observation"
             )
     return chosen

@@ -1,4 +1,4 @@
-"""Adam: made, one step, and its saved state."""
+"""Adam: construction, one step, and restoring its state."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 
 
 def adam(parameters: Sequence[Tensor], rate: float, *, capturable: bool) -> torch.optim.Adam:
-    """Make Adam over these parameters.
+    """Make Adam for these parameters.
 
     Args:
-        parameters: to learn.
+        parameters: parameters to train.
         rate: step size.
-        capturable: whether a CUDA graph can hold its step.
+        capturable: whether a CUDA graph can contain its step.
     """
     return torch.optim.Adam(parameters, lr=rate, fused=True, capturable=capturable)
 
@@ -23,7 +23,7 @@ def adam(parameters: Sequence[Tensor], rate: float, *, capturable: bool) -> torc
 def step_optimizer(
     optimizer: torch.optim.Optimizer, loss: Tensor, parameters: Sequence[Tensor]
 ) -> None:
-    """Take one gradient step on these parameters; other gradients stay as they are."""
+    """Take one gradient step on these parameters; other gradients stay unchanged."""
     optimizer.zero_grad()
     torch.autograd.backward(loss, inputs=parameters)
     optimizer.step()
@@ -32,8 +32,8 @@ def step_optimizer(
 def load_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
     """Restore Adam's moments, as copies in the memory order of the weights.
 
-    The fused step walks raw memory: moments in another order would meet the wrong weights. Whether
-    the step can be part of a CUDA graph depends on the current device, not on the saved one.
+    The fused step reads raw memory: moments in another order would be paired with the wrong
+    weights. `capturable` is kept as set for the current device, not as saved.
     """
     capturable = [group["capturable"] for group in optimizer.param_groups]
     optimizer.load_state_dict(dict(saved))

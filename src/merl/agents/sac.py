@@ -1,8 +1,8 @@
-"""Soft actor-critic with a learnt temperature (Haarnoja et al. 2018b), on the learner's parts.
+"""Soft actor-critic with a learnt temperature (Haarnoja et al. 2018b), based on the DDPG learner.
 
-What differs from the learner: the policy is a Gaussian through a tanh, whose entropy is paid for in
-the critic's target and in the actor's loss at the price alpha, and alpha is moved so that the
-entropy comes to a target. With n-step returns the entropy is paid at the last of the n steps alone.
+It differs from the learner in this: the policy is a Gaussian through a tanh; its entropy, times
+alpha, is part of the critic's target and of the actor's loss; and alpha is trained so that the
+entropy reaches a target. With n-step returns, only the last of the n steps has an entropy term.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ class SACConfig(AgentConfig):
     """SAC on the state, with a learnt temperature (Haarnoja et al. 2018b)."""
 
     images: tuple[str, ...] | None = ()
-    """Image keys to see: none."""
+    """Image keys to use: none."""
     vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to feel."""
+    """Vector keys to use."""
     latent_dim: int = 0
-    """d, the length of a fused representation; 0 is none: the state goes to the heads as it is."""
+    """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
     head_norm: bool = False
     """LayerNorm in the hidden layers of actor and critic."""
     temperature: float = 1.0
-    """alpha at the start."""
+    """Initial value of alpha."""
     target_entropy: float | None = None
-    """What the policy's entropy is to be, in nats; minus the number of actions, if not set."""
-    # The noise is the policy's own.
+    """Target of the policy's entropy, in nats; if not set, minus the dimension of the action."""
+    # Unused: the policy itself is random.
     noise_std: Annotated[float, tyro.conf.Suppress] = 0.0
     noise_std_end: Annotated[float | None, tyro.conf.Suppress] = None
     noise_steps: Annotated[int, tyro.conf.Suppress] = 1
@@ -51,8 +51,8 @@ class SACConfig(AgentConfig):
         super().__post_init__()
         if self.critic_loss != "mse":
             raise MerlError(
-                f"agent.critic-loss {self.critic_loss} needs returns within bounds, which the "
-                "entropy in SAC's returns has not: use mse"
+                f"agent.critic-loss {self.critic_loss} needs bounded returns, but the entropy "
+                "term makes SAC's returns unbounded: use mse"
             )
         if not 0 < self.temperature < math.inf:
             raise MerlError(f"agent.temperature must be above 0, not {self.temperature}")
@@ -61,13 +61,13 @@ class SACConfig(AgentConfig):
 
 
 class SAC(DDPG):
-    """The soft actor-critic.
+    """Soft actor-critic.
 
     Args:
-        networks: with a `GaussianActor`.
+        networks: networks with a `GaussianActor`.
         config: how to learn.
-        seed: of the noise and the shifts.
-        device: where everything lives.
+        seed: seed of the noise and the shifts.
+        device: see `DDPG`.
         threads: see `DDPG`.
     """
 
@@ -90,7 +90,7 @@ class SAC(DDPG):
     @with_torch_settings
     @torch.inference_mode()
     def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
-        """tanh(u), u ~ N(mu, sigma^2) when exploring, else tanh(mu); see `DDPG.act`."""
+        """Return tanh(u), u ~ N(mu, sigma^2), to explore, else tanh(mu); see `DDPG.act`."""
         mean, log_std = self._policy(observation, averaged=not explore)
         if not explore:
             return torch.tanh(mean)
@@ -100,12 +100,12 @@ class SAC(DDPG):
     def next_action(
         self, next_encoded: Mapping[str, Tensor], noise: Tensor
     ) -> tuple[Tensor, Tensor | float]:
-        """A ~ pi(o_{t+n}), (B, A), and -alpha log pi(a | o_{t+n}), (B,)."""
+        """Return a ~ pi(o_{t+n}), (B, A), and -alpha log pi(a | o_{t+n}), (B,)."""
         action, log_prob, _ = self._sample(next_encoded, noise)
         return action, -self.log_alpha.exp() * log_prob
 
     def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
-        """The actor towards actions of higher soft value; then alpha towards the target entropy."""
+        """Move the actor towards higher soft value, then alpha towards the target entropy."""
         with self._arithmetic():
             action, log_prob, mean = self._sample(encoded, noise)
             q = self.q(encoded, action)
@@ -126,11 +126,11 @@ class SAC(DDPG):
         }
 
     def epsilon(self, noise: Tensor) -> Tensor:
-        """Standard normal as it is: the policy scales it."""
+        """Return the standard normal noise unchanged: the policy scales it."""
         return noise
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next update and the next action depend on."""
+        """Return everything that the next update and the next action depend on."""
         return super().state_dict() | {
             "log_alpha": self.log_alpha.detach(),
             "alpha_optimizer": self.alpha_optimizer.state_dict(),
@@ -138,7 +138,7 @@ class SAC(DDPG):
 
     @with_torch_settings
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state_dict` gave."""
+        """Restore from `state_dict()`."""
         super().load_state_dict(state)
         with torch.no_grad():
             self.log_alpha.copy_(state["log_alpha"])
@@ -147,10 +147,10 @@ class SAC(DDPG):
     def _sample(
         self, encoded: Mapping[str, Tensor], noise: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """An action (B, A), its log pi (B,), and mu (B, A); differentiable in the actor."""
+        """Sample an action (B, A), its log pi (B,), and mu (B, A); differentiable in the actor."""
         mean, log_std = self.networks.actor(self.networks.actor_latent(encoded))
         u = mean + log_std.exp() * noise
         gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
-        # log(1 - tanh(u)^2), in a form that does not lose its digits where tanh is near 1
+        # log(1 - tanh(u)^2), in a form that stays accurate where tanh is near 1
         squashed = 2 * (math.log(2) - u - softplus(-2 * u))
         return torch.tanh(u), (gaussian - squashed).sum(-1), mean

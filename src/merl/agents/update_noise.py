@@ -1,4 +1,4 @@
-"""The random numbers of an update, as a value: a second implementation can be given the same."""
+"""The random numbers of an update as a value, so that a second implementation can use the same."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ class UpdateNoise:
     """The random numbers of one update.
 
     Attributes:
-        shifts: crops of o_t, per image key int64 (B, 2); none where the batch is shifted already.
-        next_shifts: crops of o_{t+n}, likewise.
-        next_noise: epsilon of the target's action, (B, A): clipped here, standard normal in SAC.
-        actor_noise: epsilon of the actor's action, likewise.
+        shifts: crop offsets of o_t by image key, int64 (B, 2); empty if images are shifted already.
+        next_shifts: crop offsets of o_{t+n}, in the same form.
+        next_noise: epsilon of the target's action, (B, A): scaled and clipped; in SAC standard
+            normal.
+        actor_noise: epsilon of the actor's action, in the same form.
     """
 
     shifts: dict[str, Tensor]

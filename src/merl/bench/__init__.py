@@ -1,4 +1,4 @@
-"""What is timed, and against what."""
+"""Benches: the speed of merl's parts beside references."""
 
 from __future__ import annotations
 
@@ -15,4 +15,4 @@ BENCHES: dict[str, tuple[Callable[..., dict[str, Any]], Callable[[Any], Renderab
     "replay": (replay.run, replay.table),
     "train": (train.run, train.table),
 }
-"""Name to the measurement and to how its result is shown."""
+"""{name: (function that measures, function that makes a table of the result)}."""

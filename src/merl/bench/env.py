@@ -1,7 +1,7 @@
-"""How fast the environment is, against dm_control's own with the same task and picture.
+"""Speed of the environment beside dm_control's own, with the same task and image.
 
-The sides take turns within one run, so that a machine that is busy for a while is busy for all of
-them; what counts is the median over the rounds, and the ratio is taken within each round.
+The variants take turns within one run, so that other load on the machine affects all of them.
+Results are medians over the rounds; ratios are taken within each round.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ OURS, BARE, BLIND, THEIRS = (
     "dm_control, OpenGL",
 )
 BAR, GOAL = 15.0, 25.0
-"""How many times as fast as dm_control's an environment step with `raster` is to be."""
+"""Speed of a step with `raster` in multiples of dm_control's: required, and preferred."""
 LEAST_RATE, MOST_OVERHEAD = 150.0, 0.1
-"""Steps a second on one core; what our code may add to physics and picture, as a share of them."""
+"""Required steps per second on one core; largest overhead of merl's code over physics and image."""
 
 Step = Callable[[], object]
 
 
 def run(repeats: int = 5, steps: int = 60, image_size: int = 84) -> dict[str, Any]:
-    """Time steps and resets of `reach_duplo` on every side.
+    """Time steps and resets of `reach_duplo` in every variant.
 
     Args:
-        repeats: how many rounds, in each of which every side has its turn.
-        steps: environment steps of ours in a turn; dm_control, far slower, takes a sixth.
-        image_size: height and width of our picture, in pixels; dm_control's is always 84.
+        repeats: number of rounds; in each round every variant has one turn.
+        steps: environment steps of merl in a turn; dm_control, far slower, takes a sixth of them.
+        image_size: height and width of merl's image, in pixels; dm_control's is always 84.
 
     Returns:
-        Plain values: `steps_per_s` and `reset_ms` by side, `overhead` (what our code adds to
-        physics and picture, as a share of them) and `ratio` (ours to dm_control's steps/s), each as
-        `median`, `low` and `high` over the rounds; `opengl`, which library drew dm_control's
-        pictures; or `skipped`, why that side is missing.
+        Plain values: `steps_per_s` and `reset_ms` by variant, `overhead` (time that merl's code
+        adds to physics and image, as a fraction of their time) and `ratio` (merl's to dm_control's
+        steps/s), each as `median`, `low` and `high` over the rounds; `opengl`, the library that
+        drew dm_control's images, or `skipped`, the reason why dm_control is missing.
     """
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "image_size": image_size}
     result |= circumstances()
@@ -81,35 +81,36 @@ def run(repeats: int = 5, steps: int = 60, image_size: int = 84) -> dict[str, An
 
 
 def table(result: dict[str, Any]) -> Table:
-    """What `run` returned, for people."""
+    """Return the result of `run` as a table."""
     size = result["image_size"]
     rows = Table(
-        title=f"reach_duplo, picture {size}x{size}, median of {result['repeats']} (least to most)"
+        title=f"reach_duplo, image {size}x{size}, median of {result['repeats']} (min to max)"
     )
     for heading in ("", "steps/s", "reset, ms"):
         rows.add_column(heading, justify="right" if heading else "left")
     for side, rate in result["steps_per_s"].items():
         rows.add_row(side, shown(rate), shown(result["reset_ms"][side]))
     notes = [
-        f"the bar of one is {LEAST_RATE:g} steps/s",
-        f"our code adds {shown(result['overhead'])} of physics and picture, of which it may add "
-        f"{MOST_OVERHEAD:g}",
+        f"target: {LEAST_RATE:g} steps/s",
+        f"overhead of merl's code over physics and image: {shown(result['overhead'])}, target: at "
+        f"most {MOST_OVERHEAD:g}",
     ]
     if "ratio" in result:
         notes.append(
-            f"merl / dm_control: {shown(result['ratio'])}; the bar is {BAR:g}, the goal {GOAL:g}. "
+            f"merl / dm_control: {shown(result['ratio'])}, target: {BAR:g}, preferably {GOAL:g}; "
             f"OpenGL: {result['opengl']}"
         )
     else:
-        notes.append(f"left out: {result['skipped']}")
+        notes.append(f"skipped: {result['skipped']}")
     rows.caption = "; ".join(notes)
     return rows
 
 
 def _ours(**config: Any) -> tuple[Step, Step, Step]:
+    """Return reset, step and close of merl's environment."""
     env = make_env("reach_duplo", renderer="raster", **config)
     noise = np.random.default_rng(0)
-    env.reset(seed=0)  # compiles
+    env.reset(seed=0)  # compiles the renderer
     return (
         env.reset,
         lambda: env.step(noise.uniform(-1.0, 1.0, 9).astype(np.float32)),
@@ -118,7 +119,7 @@ def _ours(**config: Any) -> tuple[Step, Step, Step]:
 
 
 def _bare(size: int) -> tuple[Step, Step, Step]:
-    """The physics of a step and its picture, without what makes an environment of them."""
+    """Return reset, step and close of physics and image alone, without the rest of a step."""
     env = make_env("reach_duplo", observations=("proprio",))
     assert isinstance(env, JacoEnv)
     env.reset(seed=0)
@@ -137,7 +138,7 @@ def _bare(size: int) -> tuple[Step, Step, Step]:
 
 
 def _theirs() -> tuple[tuple[Step, Step, Step], str]:
-    """dm_control's task with its camera, all at its defaults; and which library draws."""
+    """Return reset, step and close of dm_control's task by its defaults, and its OpenGL library."""
     check_renderer("gl")
     from dm_control import manipulation
 

@@ -1,4 +1,4 @@
-"""What every bench does alike: sides that take turns, medians with their spread, the machine."""
+"""Shared parts of the benches: turns, medians with their range, facts about the machine."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Side = TypeVar("Side", bound=Hashable)
 def take_turns(
     sides: Mapping[Side, Work], repeats: int, others: Collection[Side] = ()
 ) -> dict[Side, list[float]]:
-    """Seconds of each side in each round.
+    """Time variants ("sides") in turns; return the seconds of each side in each round.
 
-    The sides take turns within one run, so that a machine that is busy for a while is busy for all
-    of them. Each does its work once before it is timed: a turn finds the memory of its own last
-    one, not that of the side before.
+    The sides take turns within one run, so that other load on the machine affects all of them.
+    Each side does its work once before it is timed, so that a turn reuses memory of its own side,
+    not of the previous one.
 
     Args:
-        sides: work by name.
-        repeats: how many rounds.
-        others: sides that are not ours, which the C library treats as it does by itself; training
-            asks it to keep freed memory.
+        sides: {name: work}.
+        repeats: number of rounds.
+        others: sides that run with the default memory settings of the C library; the rest keeps
+            freed memory, as training does.
     """
     taken: dict[Side, list[float]] = {side: [] for side in sides}
     try:
@@ -48,7 +48,7 @@ def take_turns(
 
 
 def seconds(work: Work, times: int = 1) -> float:
-    """Of doing it so many times."""
+    """Return the seconds that `times` calls of `work` take."""
     start = time.perf_counter()
     for _ in range(times):
         work()
@@ -56,12 +56,12 @@ def seconds(work: Work, times: int = 1) -> float:
 
 
 def spread(values: list[float]) -> dict[str, float]:
-    """Median, least and most."""
+    """Return median, minimum and maximum."""
     return {"median": median(values), "low": min(values), "high": max(values)}
 
 
 def shown(spread: dict[str, float]) -> str:
-    """The median and, in brackets, from where to where."""
+    """Format a median and its range: "12.3 (11 to 14)"."""
     middle, low, high = (
         f"{spread[key]:,.0f}" if spread[key] >= 100 else f"{spread[key]:.3g}"
         for key in ("median", "low", "high")
@@ -70,7 +70,7 @@ def shown(spread: dict[str, float]) -> str:
 
 
 def circumstances() -> dict[str, Any]:
-    """Under which a figure was measured."""
+    """Return versions, commit, machine, threads and load of a measurement."""
     return {
         "merl": merl.__version__,
         "commit": commit(),

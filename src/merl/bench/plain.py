@@ -1,9 +1,9 @@
-"""MERL's update as a careful newcomer would write it: the reference that `bench update` times.
+"""MERL's update in plain PyTorch: the reference that `merl bench update` times.
 
-Eager single precision, channels first, the shift by `grid_sample`, an Adam per network, everything
-in the order of Algorithm 1: what DrQ-v2's own code does, too, which is this agent on pixels alone
-(`Plain(vector=0, latent=50, head_norm=False, average_fusion=True)`). It shares no code with the
-agents; a test holds their losses and gradients together.
+Eager mode, single precision, channels first, the random shift by `grid_sample`, one Adam per
+network, all in the order of Algorithm 1. DrQ-v2's own code does the same; DrQ-v2 is this agent on
+images alone (`Plain(vector=0, latent=50, head_norm=False, average_fusion=True)`). This module
+shares no code with the agents; a test checks that losses and gradients are equal.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from torch.nn import functional
 
 @dataclass(frozen=True)
 class Sample:
-    """A batch as such code keeps it: stacked frames as channels.
+    """A batch with stacked frames as channels.
 
     Attributes:
         image: uint8 (B, K C, H, W).
-        vector: float32 (B, n); n is 0 where there are no joints.
+        vector: float32 (B, n); n is 0 without proprioception.
         action: (B, A).
         reward: (B, 1).
         discount: (B, 1).
-        next_image: of o_{t+n}.
-        next_vector: of o_{t+n}.
+        next_image: `image` of o_{t+n}.
+        next_vector: `vector` of o_{t+n}.
     """
 
     image: Tensor
@@ -41,14 +41,14 @@ class Sample:
 
 
 class Shift(nn.Module):
-    """Random shift by up to `pad` pixels, as a bilinear sample of a padded picture."""
+    """Random shift by up to `pad` pixels, as a bilinear sample of a padded image."""
 
     def __init__(self, pad: int) -> None:
         super().__init__()
         self.pad = pad
 
     def forward(self, image: Tensor, offset: Tensor | None = None) -> Tensor:
-        """(B, C, H, H) to the same; `offset` (B, 2) in [0, 2 pad] is x, y, else drawn."""
+        """Shift images (B, C, H, H) by `offset` (B, 2): x, y in [0, 2 pad]; random if None."""
         batch, _, side, _ = image.shape
         padded = functional.pad(image, (self.pad,) * 4, mode="replicate")
         whole = side + 2 * self.pad
@@ -76,13 +76,13 @@ class Encoder(nn.Module):
         self.features = 32 * side * side
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, C, H, H) in [0, 255] to (B, F)."""
+        """Encode images (B, C, H, H) in [0, 255] as features (B, F)."""
         encoded: Tensor = self.layers(image / 255.0 - 0.5)
         return encoded.flatten(1)
 
 
 class Fuse(nn.Module):
-    """Linear, LayerNorm, tanh for each modality, side by side."""
+    """Linear, LayerNorm and tanh for each modality, concatenated."""
 
     def __init__(self, features: Iterable[int], latent: int) -> None:
         super().__init__()
@@ -93,12 +93,12 @@ class Fuse(nn.Module):
         )
 
     def forward(self, *encoded: Tensor) -> Tensor:
-        """(B, F) of each modality to (B, d)."""
+        """Fuse features (B, F) of each modality into a latent (B, d)."""
         return torch.cat([part(e) for part, e in zip(self.parts, encoded, strict=False)], dim=-1)
 
 
 def head(inputs: int, outputs: int, layers: int, width: int, norm: bool) -> nn.Sequential:
-    """Linear (LayerNorm) ReLU, and a last Linear."""
+    """Return blocks of Linear, LayerNorm (if `norm`) and ReLU, then a last Linear."""
     parts: list[nn.Module] = []
     for _ in range(layers - 1):
         parts += [nn.Linear(inputs, width), *([nn.LayerNorm(width)] if norm else []), nn.ReLU()]
@@ -107,36 +107,37 @@ def head(inputs: int, outputs: int, layers: int, width: int, norm: bool) -> nn.S
 
 
 class Critic(nn.Module):
-    """Fusion and two values."""
+    """Fusion and two Q heads."""
 
     def __init__(self, fuse: Fuse, first: nn.Module, second: nn.Module) -> None:
         super().__init__()
         self.fuse, self.first, self.second = fuse, first, second
 
     def forward(self, encoded: tuple[Tensor, Tensor], action: Tensor) -> tuple[Tensor, Tensor]:
-        """Encodings and action (B, A) to the two values, (B, 1)."""
+        """Return the two values (B, 1) of encodings and an action (B, A)."""
         return self.values(self.fuse(*encoded), action)
 
     def values(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """The same from what is fused already."""
+        """Return the two values (B, 1) of a latent (B, d) and an action (B, A)."""
         both = torch.cat([latent, action], dim=-1)
         return self.first(both), self.second(both)
 
 
 class Plain:
-    """The agent.
+    """The agent: MERL or, on images alone, DrQ-v2.
 
     Args:
-        channels: of the stacked picture.
-        side: height and width of it.
-        vector: length of what the joints tell; 0 is pixels alone.
-        actions: A.
-        layers: of the heads, the last one counted.
-        width: of the heads.
-        latent: d.
-        head_norm: LayerNorm in the heads.
-        average_fusion: whether the target averages the critic's fusion too, as DrQ-v2's does.
-        pad: of the shift.
+        channels: channels of the stacked image.
+        side: height and width of the image.
+        vector: size of the proprioception; 0 for images alone.
+        actions: size A of an action.
+        layers: layers of each head, including the last one.
+        width: hidden width of the heads.
+        latent: size d of the latent.
+        head_norm: whether the heads have LayerNorm.
+        average_fusion: whether the target averages the critic's fusion too, as in DrQ-v2.
+        pad: largest shift in pixels, in each direction.
+        learning_rate: learning rate of each Adam.
     """
 
     tau, noise, clip = 0.01, 0.2, 0.3
@@ -173,13 +174,13 @@ class Plain:
         self.actor_adam = torch.optim.Adam(actor, lr=learning_rate)
 
     def to(self, device: torch.device) -> Plain:
-        """The same agent, moved there."""
+        """Move the agent to a device and return it."""
         for module in (self.encoder, self.critic, self.critic_target, self.actor_fuse, self.actor):
             module.to(device)
         return self
 
     def update(self, sample: Sample) -> tuple[Tensor, Tensor]:
-        """One update with its own random numbers; the two losses."""
+        """Make one update with random noise and shifts; return the two losses."""
         noise, next_noise = (
             (torch.randn_like(sample.action) * self.noise).clamp(-self.clip, self.clip)
             for _ in range(2)
@@ -194,13 +195,13 @@ class Plain:
         offset: Tensor | None = None,
         next_offset: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """One update with its random numbers given."""
+        """Make one update with the given noise and shifts; return the two losses."""
         dtype = sample.action.dtype
-        picture = self.shift(sample.image.to(dtype), offset)
-        next_picture = self.shift(sample.next_image.to(dtype), next_offset)
-        encoded = self.encoder(picture), sample.vector
+        image = self.shift(sample.image.to(dtype), offset)
+        next_image = self.shift(sample.next_image.to(dtype), next_offset)
+        encoded = self.encoder(image), sample.vector
         with torch.no_grad():
-            next_encoded = self.encoder(next_picture), sample.next_vector
+            next_encoded = self.encoder(next_image), sample.next_vector
             next_action = (self.policy(next_encoded) + next_noise).clamp(-1.0, 1.0)
             target = torch.min(*self.critic_target(next_encoded, next_action))
             target = sample.reward + sample.discount * target
@@ -213,8 +214,8 @@ class Plain:
         self.critic_adam.step()
 
         encoded = encoded[0].detach(), encoded[1]
-        wanted = self.policy(encoded) + noise
-        action = wanted + (wanted.clamp(-1.0, 1.0) - wanted).detach()
+        noisy = self.policy(encoded) + noise
+        action = noisy + (noisy.clamp(-1.0, 1.0) - noisy).detach()
         with torch.no_grad():
             latent = self.critic.fuse(*encoded)
         actor_loss = -torch.min(*self.critic.values(latent, action)).mean()
@@ -230,5 +231,5 @@ class Plain:
         return critic_loss.detach(), actor_loss.detach()
 
     def policy(self, encoded: tuple[Tensor, Tensor]) -> Tensor:
-        """The mean action."""
+        """Return the mean action (B, A)."""
         return torch.tanh(self.actor(self.actor_fuse(*encoded)))

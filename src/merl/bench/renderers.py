@@ -1,4 +1,4 @@
-"""Which renderers work here, and how fast they draw."""
+"""Renderers that work on this machine, and their speed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FRAMES = 20
 
 
 def renderer_speeds(task: str = "reach_duplo", size: int = 84) -> dict[str, float | str]:
-    """Frames per second of each renderer, or one line on why it does not work."""
+    """Return the frames per second of each renderer, or one line that says why it fails."""
     return {name: _speed(task, size, name) for name in get_args(RendererName)}
 
 
@@ -28,7 +28,7 @@ def _speed(task: str, size: int, name: RendererName) -> float | str:
         )
         try:
             env.reset(seed=0)
-            env.render()  # the first picture builds what the others use
+            env.render()  # the first call builds what later calls reuse
             start = time.perf_counter()
             for _ in range(FRAMES):
                 env.render()
@@ -37,5 +37,5 @@ def _speed(task: str, size: int, name: RendererName) -> float | str:
             env.close()
     except MerlError as error:
         return str(error)
-    except Exception as error:  # whatever a driver does: that it does not work is the answer
+    except Exception as error:  # a driver may raise anything; report it as the result
         return f"fails with {type(error).__name__}: {error}"

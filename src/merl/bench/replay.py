@@ -1,7 +1,7 @@
-"""How long the replay takes to give a batch, raw and compressed, and the space that it needs.
+"""Time to sample a batch from the replay, raw and compressed, and the space that it needs.
 
-A batch is 256 pairs of observations, of three 84x84 pictures each, stacked and shifted: bytes are
-what the networks take. The pictures are an arm's, moved at random.
+A batch has 256 pairs of observations with three 84x84 images each, stacked and shifted, as bytes:
+the input of the networks. The images show an arm that moves at random.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ BARS_GB = {RAW: 22.0, COMPRESSED: 6.0}
 
 
 def run(repeats: int = 15, steps: int = 10_000, batch_size: int = 256) -> dict[str, Any]:
-    """Time a batch on both sides, on one thread.
+    """Time a batch from a raw and from a compressed replay, on one thread.
 
     Args:
-        repeats: how many rounds, in each of which each side gives a batch.
-        steps: that each ring holds; far more than a cache does.
+        repeats: number of rounds; in each round both replays give one batch.
+        steps: steps that each replay holds; far more than fit into a processor cache.
         batch_size: B.
 
     Returns:
-        Plain values, by side: `sample_ms`, `ready_ms` (what is sampled, and that shifted),
-        `input_ms` (and as the numbers that the first convolution multiplies, in fp32, which is the
-        encoder's part) and `write_us` for a step, each as `median`, `low` and `high`;
-        `picture_bytes`, what a picture of this task takes; `gigabytes`, what a million steps
-        reserve; the circumstances.
+        Plain values, for raw and compressed: `sample_ms`; `ready_ms` (sampling and shifting);
+        `input_ms` (sampling, shifting and the encoder's conversion to fp32, the input of the first
+        convolution); `write_us`, for a step; each as `median`, `low` and `high`. Also
+        `picture_bytes`, the size of an image of this task; `gigabytes`, the space reserved for a
+        million steps; and the values of `circumstances`.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -54,30 +54,32 @@ def run(repeats: int = 15, steps: int = 10_000, batch_size: int = 256) -> dict[s
 
 
 def table(result: dict[str, Any]) -> Table:
-    """What `run` returned, for people."""
-    title = f"{result['batch_size']} pairs of 3 pictures 84x84 from {result['steps']:,} steps"
-    rows = Table(title=f"{title}, one thread, median of {result['repeats']} (least to most)")
+    """Return the result of `run` as a table."""
+    title = f"{result['batch_size']} pairs of 3 images 84x84 from {result['steps']:,} steps"
+    rows = Table(title=f"{title}, one thread, median of {result['repeats']} (min to max)")
     for heading in ("", *BARS_MS):
         rows.add_column(heading, justify="right" if heading else "left")
 
     def add(name: str, key: str) -> None:
         rows.add_row(name, *(shown(result[key][side]) for side in BARS_MS))
 
-    add("sampled, ms", "sample_ms")
-    add("and shifted: ready for the networks, ms", "ready_ms")
-    rows.add_row("    the bar", *(f"{bar:g}" for bar in BARS_MS.values()))
-    add("and as the numbers that the encoder makes of it, ms", "input_ms")
-    add("a step written, us", "write_us")
-    rows.add_row("a picture, bytes", *(f"{result['picture_bytes'][s]:,.0f}" for s in BARS_MS))
-    rows.add_row("a million steps, GB", *(f"{result['gigabytes'][s]:.3g}" for s in BARS_GB))
-    rows.add_row("    the bar", *(f"{bar:g}" for bar in BARS_GB.values()))
+    add("sample, ms", "sample_ms")
+    add("sample and shift: ready for the networks, ms", "ready_ms")
+    rows.add_row("    target", *(f"{bar:g}" for bar in BARS_MS.values()))
+    add("the same, converted to fp32 as by the encoder, ms", "input_ms")
+    add("write a step, us", "write_us")
+    rows.add_row("an image, bytes", *(f"{result['picture_bytes'][s]:,.0f}" for s in BARS_MS))
+    rows.add_row(
+        "space for a million steps, GB", *(f"{result['gigabytes'][s]:.3g}" for s in BARS_GB)
+    )
+    rows.add_row("    target", *(f"{bar:g}" for bar in BARS_GB.values()))
     return rows
 
 
 def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "batch_size": batch_size}
     result |= circumstances()
-    space, actions, seen = _pictures()
+    space, actions, seen = _observations()
     million = {
         side: replay_bytes(ReplayConfig(compress=side == COMPRESSED), space, actions, MILLION) / 1e9
         for side in BARS_GB
@@ -114,7 +116,11 @@ def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
 
 
 def _check_room(folder: Path, space: spaces.Dict, actions: spaces.Box, steps: int) -> None:
-    """Raise MerlError unless both rings have room where temporary files lie."""
+    """Check that both replays fit into the folder for temporary files.
+
+    Raises:
+        MerlError: they do not.
+    """
     need = sum(
         replay_bytes(ReplayConfig(compress=side == COMPRESSED), space, actions, steps)
         for side in BARS_MS
@@ -122,13 +128,13 @@ def _check_room(folder: Path, space: spaces.Dict, actions: spaces.Box, steps: in
     free = free_disk(folder)
     if need > free:
         raise MerlError(
-            f"what is measured takes {need / 1e9:.3g} GB in {folder.parent}, where {free / 1e9:.3g}"
-            " GB are free: name a larger folder in TMPDIR"
+            f"this bench takes {need / 1e9:.3g} GB in {folder.parent}, but {free / 1e9:.3g} GB are "
+            "free: set TMPDIR to a larger folder"
         )
 
 
-def _pictures() -> tuple[spaces.Dict, spaces.Box, list[dict[str, Any]]]:
-    """The spaces, and observations of some episodes."""
+def _observations() -> tuple[spaces.Dict, spaces.Box, list[dict[str, Any]]]:
+    """Return the spaces, and observations of some episodes with random actions."""
     env = make_env("reach_duplo", renderer="raster")
     space, actions = env.observation_space, env.action_space
     assert isinstance(space, spaces.Dict)
@@ -149,7 +155,7 @@ def _pictures() -> tuple[spaces.Dict, spaces.Box, list[dict[str, Any]]]:
 def _fill(
     ring: EpisodeRing, seen: list[dict[str, Any]], actions: spaces.Box, steps: int
 ) -> list[float]:
-    """Write the observations over and over; microseconds a step, by episode."""
+    """Write the observations repeatedly; return the microseconds per step of each episode."""
     action = actions.sample().astype(np.float32)
     taken: list[float] = []
     for begin in range(0, steps, EPISODE):
@@ -165,7 +171,7 @@ def _fill(
 
 
 def _mean_bytes(directory: Path, space: spaces.Dict) -> float:
-    """Of a picture, as it lies there."""
+    """Return the mean size of an image in the replay folder, in bytes."""
     spans = directory / "observation.image.span.bin"
     if not spans.exists():
         return float(np.prod(space["image"].shape or ()))
@@ -174,7 +180,7 @@ def _mean_bytes(directory: Path, space: spaces.Dict) -> float:
 
 
 def _stages(ring: EpisodeRing, batch_size: int) -> dict[str, Work]:
-    """A batch, as far as each of `STAGES`."""
+    """Return {stage: function that makes a batch up to this stage}, for each of `STAGES`."""
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
 
     def sample(*copies: FrameTransforms) -> list[Tensor]:

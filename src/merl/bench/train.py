@@ -1,7 +1,7 @@
-"""The whole loop: acting, replay and updates, one after another or at the same time.
+"""Speed of the whole training loop: acting, replay and updates, in turns or at the same time.
 
-Every way to run it is a loop of its own with its own agent and replay; they take turns of some
-steps each. What counts is the ratio to the strict loop within a round.
+Each variant is a separate loop with its own agent and replay; the variants take turns of some steps
+each. The result is the ratio to the strict loop within a round.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from merl.training.updating import make_update
 
 STRICT = "strict: one environment, in turn with the learner"
 WARM_UP = 100
-"""Steps of every side before its first update."""
+"""Steps of each variant before its first update."""
 CAPACITY = 10_000
-"""Steps that a replay keeps."""
+"""Steps that each replay holds."""
 
 
 def run(
@@ -44,17 +44,17 @@ def run(
     task: str = "reach_duplo",
     preset: str | None = None,
 ) -> dict[str, Any]:
-    """Time the loop, with updates from the start; on a GPU where there is one.
+    """Time the training loop, on a GPU if there is one; every turn includes updates.
 
     Args:
-        repeats: how many rounds, in each of which every side has its turn.
-        steps: environment steps of a turn; if not set, 400, on a GPU 2000.
-        task: what is trained on.
-        preset: whose values; if not set, laptop's, on a GPU paper's.
+        repeats: number of rounds; in each round every variant has one turn.
+        steps: environment steps in a turn; by default 400, on a GPU 2000.
+        task: the task to train on.
+        preset: the preset of the values; by default laptop, on a GPU paper.
 
     Returns:
-        Plain values: `steps_per_s` by side and `ratio` to the strict loop, each as `median`, `low`
-        and `high` over the rounds; `precision`, `threads` and `updates_per_step`.
+        Plain values: `steps_per_s` by variant and `ratio` to the strict loop, each as `median`,
+        `low` and `high` over the rounds; `precision`, `threads` and `updates_per_step`.
     """
     on_gpu = torch.cuda.is_available()
     steps = steps or (2000 if on_gpu else 400)
@@ -79,14 +79,14 @@ def run(
 def steps_per_second(
     sides: Mapping[Side, Mapping[str, Any]], task: str, preset: str, repeats: int, steps: int
 ) -> tuple[dict[Side, list[float]], TrainConfig]:
-    """The rate of the loop in each round, and with which values it was run.
+    """Return the steps per second of each variant in each round, and the config of the loop.
 
     Args:
-        sides: by name, the fields of `TrainConfig` in which a way to run it differs.
-        task: what is trained on.
-        preset: whose values.
-        repeats: how many rounds, in each of which every side has its turn.
-        steps: environment steps of a turn.
+        sides: {name of a variant: the fields of `TrainConfig` in which it differs}.
+        task: the task to train on.
+        preset: the preset of the values.
+        repeats: number of rounds; in each round every variant has one turn.
+        steps: environment steps in a turn.
     """
     config = dataclasses.replace(compose(preset, task), random_steps=WARM_UP, seed_steps=WARM_UP)
     with ExitStack() as stack:
@@ -113,14 +113,14 @@ def steps_per_second(
 
 
 def table(result: dict[str, Any]) -> Table:
-    """What `run` returned, for people."""
+    """Return the result of `run` as a table."""
     rows = Table(
         title=f"{result['task']}, preset {result['preset']}, "
-        f"{counted(result['updates_per_step'], 'update')} a step in "
+        f"{counted(result['updates_per_step'], 'update')} per step in "
         f"{result['precision']} on {counted(result['threads'], 'thread')}, "
-        f"median of {result['repeats']} (least to most)"
+        f"median of {result['repeats']} (min to max)"
     )
-    for heading in ("", "steps/s", "to the strict loop"):
+    for heading in ("", "steps/s", "ratio to the strict loop"):
         rows.add_column(heading, justify="right" if heading else "left")
     for side, rate in result["steps_per_s"].items():
         rows.add_row(side, shown(rate), shown(result["ratio"][side]))
@@ -128,7 +128,7 @@ def table(result: dict[str, Any]) -> Table:
 
 
 def _sides() -> dict[str, dict[str, Any]]:
-    """The ways to run the loop, by what they are called."""
+    """Return {name of a variant: its fields of `TrainConfig`}."""
     several = max(4, len(os.sched_getaffinity(0)) - 1)
     return {
         STRICT: {"synchronous": True, "num_envs": 1},
@@ -141,7 +141,7 @@ def _sides() -> dict[str, dict[str, Any]]:
 
 
 class _Loop:
-    """One way to run it, that can be stopped and gone on with at every step."""
+    """A training loop that can be run for some steps at a time."""
 
     def __init__(self, config: TrainConfig, stack: ExitStack) -> None:
         env = make_run_env(config)
@@ -161,11 +161,11 @@ class _Loop:
         collector = Collector(environments, replay, stacks)
         randomness = Randomness(config.seed)
         update = make_update(agent, replay, randomness, config, lambda _: None)
-        self._moments = train(collector, agent, update, self._progress, randomness, config)
+        self._results = train(collector, agent, update, self._progress, randomness, config)
 
     def rate(self, steps: int) -> float:
-        """Go on by so many steps, or a few more; returns steps per second."""
+        """Run at least `steps` further steps; return the steps per second."""
         first, begun = self._progress.step, time.perf_counter()
         while self._progress.step < first + steps:
-            next(self._moments)
+            next(self._results)
         return (self._progress.step - first) / (time.perf_counter() - begun)

@@ -1,7 +1,7 @@
-"""How fast an update is, against the same update written plainly.
+"""Speed of an update beside the same update in plain PyTorch (`merl.bench.plain`).
 
-On the same work: 84x84 pictures, three frames, 24 numbers of proprioception, 9 actions, batch 256;
-MERL with the heads of six layers that the paper has for `move_box` and `lift_box`, and DrQ-v2.
+Both have the same work: 84x84 images, three frames, proprioception of size 24, actions of size 9,
+batch 256; MERL with heads of six layers, as in the paper for `move_box` and `lift_box`, and DrQ-v2.
 """
 
 from __future__ import annotations
@@ -37,33 +37,33 @@ REFERENCE, OURS, DRQV2, OUR_DRQV2, SB3 = (
     "Stable-Baselines3 TD3",
 )
 SB3_DIFFERS = (
-    "its own work: no random shift, no 3-step returns for Dict observations, no LayerNorm, no "
-    "fusion; it averages the encoder too, and samples from its buffer"
+    "not the same update: no random shift, no 3-step returns for Dict observations, no LayerNorm, "
+    "no fusion; its target averages the encoder too, and it samples from its buffer"
 )
 BARS = {f"{OURS}, bf16": 6.0, f"{OURS}, fp32": 1.5}
-"""How many times as fast as the reference it is to be, on two cores with AMX-bf16."""
-WHOLE, COMPILED = ", drawn on the card", ", compiled"
+"""Required speed in multiples of the reference's, on two cores with AMX-bf16."""
+WHOLE, COMPILED = ", sampled on the GPU", ", compiled"
 BARS_ON_GPU = {f"{OURS}, bf16{WHOLE}": 4.0, f"{OURS}, bf16{WHOLE}{COMPILED}": 4.0}
-"""Likewise, whichever of the two training takes."""
+"""The same on a GPU; it applies to the variant that training chooses."""
 UPDATES_ON_GPU = 50
-"""In a turn."""
+"""Updates in a turn."""
 
 
 def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
-    """Time an update on every side, on a GPU where there is one, else on all threads.
+    """Time an update in every variant, on a GPU if there is one, else on all threads.
+
+    On a GPU, a turn has `UPDATES_ON_GPU` updates, and there are further variants: the whole update
+    as in training, with its batch sampled from a replay on the GPU; in bf16 also with
+    torch.compile, if that works.
 
     Args:
-        repeats: how many rounds, in each of which every side has its turn.
+        repeats: number of rounds; in each round every variant has one turn.
         batch_size: B.
 
-    On a GPU each turn is `UPDATES_ON_GPU` updates, and beside the update from a batch that lies on
-    the card there is the whole of it, drawn from a replay that lies there, as training makes it; in
-    bf16 by torch.compile, too, where that runs.
-
     Returns:
-        Plain values: `updates_per_s` by side and `ratio` (to the reference of the same agent,
+        Plain values: `updates_per_s` by variant and `ratio` (to the reference of the same agent,
         within each round), each as `median`, `low` and `high` over the rounds; `skipped` and
-        `not_compiled`, why a side is missing; the circumstances.
+        `not_compiled`, the reasons why a variant is missing; the values of `circumstances`.
     """
     device = choose_device("auto")
     on_gpu = device.type == "cuda"
@@ -93,7 +93,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
             of[name] = reference
             if replay is None:
                 continue
-            # A recording that fails may leave torch's generators amiss: one that does not follows.
+            # A failed recording may break torch's generators: a recording that works follows it.
             for compiled in (True, False) if precision == "bf16" else (False,):
                 whole = f"{name}{WHOLE}{COMPILED if compiled else ''}"
                 learner = learner_of(agent, precision, device, compiled=compiled)
@@ -124,26 +124,26 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> Table:
-    """What `run` returned, for people."""
+    """Return the result of `run` as a table."""
     title = f"an update, batch {result['batch_size']}, median of {result['repeats']}"
-    rows = Table(title=f"{title} (least to most), {counted(result['threads'], 'thread')}")
-    for heading in ("", "updates/s", "times the reference", "bar"):
+    rows = Table(title=f"{title} (min to max), {counted(result['threads'], 'thread')}")
+    for heading in ("", "updates/s", "times the reference", "target"):
         rows.add_column(heading, justify="right" if heading else "left")
     bars = BARS_ON_GPU if result["machine"]["gpu"] else BARS
     for side, rate in result["updates_per_s"].items():
         ratio = result["ratio"].get(side)
         bar = bars.get(side)
         rows.add_row(side, shown(rate), shown(ratio) if ratio else "", f"{bar:g}" if bar else "")
-    notes = [] if result["machine"]["gpu"] else ["the bars are for two cores with AMX-bf16"]
-    notes += [f"left out: {result[why]}" for why in ("skipped", "not_compiled") if why in result]
+    notes = [] if result["machine"]["gpu"] else ["the targets are for two cores with AMX-bf16"]
+    notes += [f"skipped: {result[why]}" for why in ("skipped", "not_compiled") if why in result]
     if "stable_baselines" in result:
-        notes.append(f"{SB3} is {result['stable_baselines']}")
+        notes.append(f"{SB3}: {result['stable_baselines']}")
     rows.caption = "; ".join(notes)
     return rows
 
 
 def reference_of(agent: str) -> Plain:
-    """The plain form of `merl` or `drqv2`, in the size that is timed."""
+    """Return the plain form of `merl` or `drqv2`, in the size that is timed."""
     channels = 3 * STACK
     if agent == "merl":
         return Plain(channels, SIDE, PROPRIO, ACTIONS, layers=LAYERS)
@@ -160,7 +160,7 @@ def reference_of(agent: str) -> Plain:
 
 
 def as_sample(batch: Batch, *, vector: bool) -> Sample:
-    """A batch of replay's as a newcomer would keep it: frames stacked as channels."""
+    """Convert a batch of the replay to the plain form: frames stacked as channels."""
 
     def stacked(images: Tensor) -> Tensor:  # (B, K, H, W, C) to (B, K C, H, W)
         return images.permute(0, 1, 4, 2, 3).flatten(1, 2).contiguous()
@@ -185,7 +185,7 @@ def learner_of(
     *,
     compiled: bool = False,
 ) -> DDPG:
-    """Ours, in the size that is timed, for pictures of `side` pixels squared."""
+    """Return merl's agent in the size that is timed, for images of `side` x `side` pixels."""
     config = Arithmetic(precision, torch.get_num_threads(), compiled).decided(AGENTS[agent])
     if agent == "merl":
         config = dataclasses.replace(config, head_layers=LAYERS)
@@ -194,7 +194,7 @@ def learner_of(
 
 
 def noise_replay(steps: int = 2000) -> EpisodeRing:
-    """A replay of noise, in episodes of 250 steps."""
+    """Return a replay filled with noise, in episodes of 250 steps."""
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
     replay = EpisodeRing(ReplayConfig(), space_of(), actions, capacity=steps)
     rng = np.random.default_rng(0)
@@ -211,7 +211,7 @@ def noise_replay(steps: int = 2000) -> EpisodeRing:
 
 
 def space_of(side: int = SIDE) -> spaces.Dict:
-    """What is seen and felt."""
+    """Return the observation space: `image` and `proprio`."""
     return spaces.Dict(
         {
             "image": spaces.Box(0, 255, (side, side, 3), np.uint8),
@@ -221,7 +221,7 @@ def space_of(side: int = SIDE) -> spaces.Dict:
 
 
 def noise_batch(size: int, side: int = SIDE) -> Batch:
-    """A batch of noise, always the same for the same size."""
+    """Return a batch of noise, the same for each call with the same size."""
     generator = torch.Generator().manual_seed(0)
 
     def observation() -> dict[str, Tensor]:
@@ -237,10 +237,10 @@ def noise_batch(size: int, side: int = SIDE) -> Batch:
 
 
 def _stable_baselines(batch_size: int, device: torch.device) -> Work:
-    """An update of its TD3 with the same encoder.
+    """Return an update of Stable-Baselines3's TD3 with the same encoder.
 
     Raises:
-        MerlError: it is not installed.
+        MerlError: Stable-Baselines3 is not installed.
     """
     try:
         from stable_baselines3 import TD3
@@ -250,7 +250,7 @@ def _stable_baselines(batch_size: int, device: torch.device) -> Work:
         raise MerlError('not installed: pip install "merl-rl[bench]"') from None
 
     class Extractor(BaseFeaturesExtractor):  # type: ignore[misc]
-        """The convolutions and the joints, side by side."""
+        """The encoded image and the proprioception, concatenated."""
 
         def __init__(self, observation_space: spaces.Dict) -> None:
             encoder = Encoder(3 * STACK, SIDE)
@@ -291,7 +291,7 @@ def _stable_baselines(batch_size: int, device: torch.device) -> Work:
 
 
 class _Idle(gymnasium.Env[Any, Any]):
-    """Spaces, for who wants an environment before it can learn."""
+    """Dummy environment that only provides spaces."""
 
     def __init__(self) -> None:
         self.observation_space = spaces.Dict(

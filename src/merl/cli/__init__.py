@@ -1,9 +1,9 @@
 """The command line.
 
-Exit codes (docs/running.md): 0 done; 2 bad input, told in one line; 3 a NaN or an infinity stopped
-the run; 4 an environment failed, a run that had begun is saved; 5 the run ended, but its end could
-not be saved; 129, 130, 138 and 143 stopped by SIGHUP, Ctrl-C, SIGUSR1 or SIGTERM, and saved; 141
-nobody reads what a command prints that does nothing else.
+Exit codes (docs/running.md): 0 success; 2 bad input, reported in one line; 3 a NaN or an infinity
+stopped the run; 4 an environment failed (a run that had begun is saved); 5 the run ended, but its
+last checkpoint or metrics could not be saved; 129, 130, 138 and 143 stopped by SIGHUP, Ctrl-C,
+SIGUSR1 or SIGTERM, and saved; 141 nothing reads the output of a command that only prints.
 """
 
 from __future__ import annotations
@@ -25,42 +25,43 @@ from merl.core import MerlError, suggest
 from merl.core.output import tolerant_output
 from merl.core.python_path import working_folder_hidden
 
-# The modules are imported when called: a misspelt command should not wait for torch.
+# A module is imported when its command runs: a misspelt command does not wait for torch.
 COMMANDS = {
     "train": ("merl.cli.train", "train", "train an agent"),
-    "resume": ("merl.cli.resume", "resume", "go on with a run"),
-    "evaluate": ("merl.cli.evaluate", "evaluate", "run a trained policy, film it"),
-    "tasks": ("merl.cli.tasks", "tasks", "what there is to learn"),
-    "info": ("merl.cli.info", "info", "what this machine offers"),
-    "bench": ("merl.cli.bench", "bench", "time merl against what there was before"),
+    "resume": ("merl.cli.resume", "resume", "resume a run"),
+    "evaluate": ("merl.cli.evaluate", "evaluate", "evaluate a trained policy, record a video"),
+    "tasks": ("merl.cli.tasks", "tasks", "list the tasks"),
+    "info": ("merl.cli.info", "info", "show versions, hardware and measured speed"),
+    "bench": ("merl.cli.bench", "bench", "measure merl's speed beside a reference"),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code.
+    """Run a command and return its exit code.
 
-    What it prints may be lost, the command is not ended by that; but one that only prints tells by
-    its exit code that nobody reads it.
+    A command continues if its output cannot be written. A command that only prints then returns a
+    nonzero exit code.
     """
     args = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with tolerant_output() as (out, _), working_folder_hidden():
             code = _run(args)
-    except SystemExit:  # after printing help
+    except SystemExit:  # tyro exits after it has printed the help
         if out.error is None:
             raise
         code = 0
-    if code != 0 or out.error is None or (args[:1] in _OBSERVED and not _asks_help(args)):
+    if code != 0 or out.error is None or (args[:1] in _TRAINING and not _asks_help(args)):
         return code
     if out.error.errno == errno.EPIPE:
         return 128 + signal.SIGPIPE
     with tolerant_output():
-        print(f"merl: error: the output was not written: {out.error.strerror}", file=sys.stderr)
+        reason = out.error.strerror
+        print(f"merl: error: the output could not be written: {reason}", file=sys.stderr)
     return MerlError.exit_code
 
 
-_OBSERVED = (["train"], ["resume"])
-"""Commands that do not only print."""
+_TRAINING = (["train"], ["resume"])
+"""Commands that do more than print; lost output does not change their exit code."""
 
 
 def _asks_help(args: Sequence[str]) -> bool:
@@ -93,14 +94,16 @@ def _run(args: list[str]) -> int:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """Show a warning in one line, without its place in the source; not those for developers."""
+    """Print a warning in one line, without its source location; skip DeprecationWarning."""
     if issubclass(category, DeprecationWarning):
         return
-    text = " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(message)).split())  # some come in colours
+    text = " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(message)).split())  # without terminal colours
     if text:
         print(f"merl: warning: {text}", file=sys.stderr)
 
 
 def _usage() -> str:
     lines = [f"  {name:<10}{about}" for name, (_, _, about) in COMMANDS.items()]
-    return "\n".join(["usage: merl COMMAND ...", "", *lines, "", "merl COMMAND --help tells more."])
+    return "\n".join(
+        ["usage: merl COMMAND ...", "", *lines, "", "merl COMMAND --help shows its options."]
+    )

@@ -1,4 +1,4 @@
-"""python -m merl.cli."""
+"""Run the command line: python -m merl.cli."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""merl bench."""
+"""The command merl bench."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from merl.core import MerlError, suggest
 
 
 def bench(args: list[str]) -> int:
-    """Time what merl does against what there was before: merl bench env."""
+    """Time merl beside a reference, and print a table: merl bench env."""
     if not args or args[0] in ("-h", "--help"):
         print(f"usage: merl bench {{{','.join(BENCHES)}}} [--repeats N] [--json FILE]")
         return 0
@@ -19,11 +19,11 @@ def bench(args: list[str]) -> int:
         raise MerlError(f"bench {args[0]!r} is unknown: {suggest(args[0], BENCHES)}")
 
     def command(repeats: int = 5, json: Path | None = None) -> tuple[int, Path | None]:
-        """Interleaved repeats on the same work, medians and their spread.
+        """Time variants of the same work in turns; print medians and ranges.
 
         Args:
-            repeats: How often each side is measured.
-            json: Also write the figures into this file.
+            repeats: How often each variant is timed.
+            json: Also write the numbers to this file.
         """
         return repeats, json
 

@@ -1,4 +1,4 @@
-"""How long a run takes: said before it begins, or after its first steps."""
+"""The expected duration of a run, printed before it begins or after its first steps."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from merl.training.timing import Timing
 from merl.training.trainer import Trainer
 
 FIRST_STEPS = 50
-"""Steps of the environment, from which its time per step is taken."""
+"""Environment steps that are timed to estimate the time per step."""
 
 
 def duration(config: TrainConfig, timing: Timing, done: int) -> str:
-    """Return how much there is to do, and how long it takes, in one line.
+    """Return how many steps remain and how long they take, in one line.
 
     Args:
-        config: of the run.
-        timing: what this machine needs.
-        done: steps that the run has taken already.
+        config: the config of the run.
+        timing: the measured times of a step and of an update.
+        done: steps that the run has already taken.
     """
     left = config.steps - done
     steps = counted(left, "step")
@@ -35,7 +35,7 @@ def duration(config: TrainConfig, timing: Timing, done: int) -> str:
     where = f"of {config.task} on {config.device}"
     if not timing.knows_env:
         bound = "" if limit is None else f" in at most {limit}"
-        later = f" (how long they take is said after the first {FIRST_STEPS})"
+        later = f" (their duration is printed after the first {FIRST_STEPS})"
         return f"{steps} {where}{bound}{later if left > FIRST_STEPS else ''}"
     seconds = timing.seconds(dataclasses.replace(config, minutes=None), done)
     about = f"about {timedelta(seconds=round(seconds))}"
@@ -46,7 +46,7 @@ def duration(config: TrainConfig, timing: Timing, done: int) -> str:
 
 
 class DurationView(LiveView):
-    """The live view, which times the first steps if the environment was not timed before.
+    """Live view that times the first steps if the environment was not timed before training.
 
     Args:
         console: where to print.
@@ -56,7 +56,7 @@ class DurationView(LiveView):
     def __init__(self, console: Console, scale: Mapping[str, float]) -> None:
         super().__init__(console, scale)
         self._timing: Timing | None = None  # until the duration is printed
-        self._first: tuple[float, StepResult] | None = None  # the time of the first step
+        self._first: tuple[float, StepResult] | None = None  # time and first step
 
     def on_start(self, trainer: Trainer) -> None:
         """See `Callback`."""

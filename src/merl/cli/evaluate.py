@@ -1,4 +1,4 @@
-"""merl evaluate."""
+"""The command merl evaluate."""
 
 from __future__ import annotations
 
@@ -25,26 +25,25 @@ from merl.training.live_view import describe
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """Run a trained policy without noise, from the evaluation's fixed starts."""
+    """Run a trained policy without exploration noise, from the fixed start states."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     episodes: int = 10
-    """How many episodes."""
+    """Number of episodes."""
     video: Path | None = None
-    """Film the first episode into this file (MP4)."""
+    """Record a video of the first episode in this file (MP4)."""
     max_episode_steps: int | None = None
-    """Steps after which an episode is cut; as the run has it (--eval.max-episode-steps), if not
-    set."""
+    """Steps after which an episode is cut off; by default the run's --eval.max-episode-steps."""
     checkpoint: str = "latest"
-    """latest, best (by evaluation return), or a number of steps."""
+    """latest, best (the highest evaluation return), or the step of a checkpoint."""
     renderer: RendererName | None = None
-    """What draws the pictures, if not what the agent was trained with."""
+    """Renderer of the images; by default the one that the agent was trained with."""
     trust: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Import the environment that the run names, although you have not trained this run here: that
-    runs the code of whoever made the run."""
+    """Import the environment that the run names, although you have not trained this run here. This
+    runs the code of the run's author."""
     json: Path | None = None
-    """Also write every episode's seed, return and success into this file."""
+    """Also write the seed, return and success of each episode to this file."""
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
@@ -61,8 +60,8 @@ def evaluate(args: list[str]) -> int:
     """Evaluate a run: merl evaluate RUN [--episodes N] [--video FILE] ..."""
     options = parse(EvaluateOptions, "merl evaluate", args)
     check_writable(options.json)
-    # Absolute before any user code runs, which may change the working folder.
-    file, film = _absolute(options.json), _absolute(options.video)
+    # Resolve paths before user code runs: it may change the working folder.
+    json_file, video_file = _absolute(options.json), _absolute(options.video)
     console = make_console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
     changes: dict[str, Any] = {} if options.renderer is None else {"renderer": options.renderer}
@@ -82,22 +81,22 @@ def evaluate(args: list[str]) -> int:
             env,
             options.episodes,
             reset=policy.reset,
-            video=film,
+            video=video_file,
             max_steps=config.eval_steps,
             reports_success=policy.reports_success,
         )
     finally:
         env.close()
-    seen = "" if policy.config.own_env else f", {options.renderer or policy.config.env.renderer}"
-    pictures = f"{seen} pictures" if seen else ""
-    told = f"{options.run} at step {policy.step:,}{pictures}: {describe(result)}"
-    console.print(told, highlight=False)
-    beside = references(config.task, config.evaluated.env)
-    if beside:
-        console.print(comparison(config.task, result, beside), highlight=False)
+    renderer = options.renderer or policy.config.env.renderer
+    images = "" if policy.config.own_env else f", {renderer} images"
+    line = f"{options.run} at step {policy.step:,}{images}: {describe(result)}"
+    console.print(line, highlight=False)
+    known = references(config.task, config.evaluated.env)
+    if known:
+        console.print(comparison(config.task, result, known), highlight=False)
     if options.video is not None:
         console.print(f"video: {options.video}", highlight=False, soft_wrap=True)
-    if file is not None:
+    if json_file is not None:
         rows = [
             {
                 "seed": EVALUATION_SEED + i,
@@ -105,7 +104,7 @@ def evaluate(args: list[str]) -> int:
             }
             for i, episode in enumerate(result.episodes)
         ]
-        write_json(file, {"run": str(options.run), "step": policy.step, "episodes": rows})
+        write_json(json_file, {"run": str(options.run), "step": policy.step, "episodes": rows})
     return 0
 
 

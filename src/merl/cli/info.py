@@ -1,4 +1,4 @@
-"""merl info."""
+"""The command merl info."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from merl.training.setup import Setup
 
 TASK = "reach_duplo"
 FEATURES = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
-"""Processor features that decide how fast an update is, as Linux names them."""
+"""Processor features that determine the speed of an update, by their names in Linux."""
 
 
 def info(args: list[str]) -> int:
-    """Versions, processor, GPU, memory, renderers and their speed, expected steps per second."""
+    """Print versions, processor, GPU, memory, renderer speeds and the expected training speed."""
 
     def command() -> None:
-        """Show what this machine offers, measured here (takes half a minute)."""
+        """Show versions, hardware and measured speed (takes half a minute)."""
 
     parse(command, "merl info", args)
     console = make_console()
@@ -41,10 +41,10 @@ def info(args: list[str]) -> int:
 def _rows() -> Iterator[tuple[str, str]]:
     yield "merl", merl.__version__
     yield from package_versions().items()
-    here = machine()
-    yield "processor", f"{here['processor']}, {counted(here['cores'], 'core')}"
-    yield "features", ", ".join(processor_features()) or "none of note"
-    yield "GPU", here["gpu"] or "none that torch finds"
+    hardware = machine()
+    yield "processor", f"{hardware['processor']}, {counted(hardware['cores'], 'core')}"
+    yield "features", ", ".join(processor_features()) or f"none of {', '.join(FEATURES)}"
+    yield "GPU", hardware["gpu"] or "none found by torch"
     yield "memory", f"{available_memory() / 1e9:.1f} GB available to this process"
     yield "disk", f"{free_disk(Path.cwd()) / 1e9:.1f} GB free here"
     for name, speed in renderer_speeds(TASK).items():
@@ -55,7 +55,7 @@ def _rows() -> Iterator[tuple[str, str]]:
 
 
 def processor_features() -> list[str]:
-    """Those of `FEATURES` that this processor has."""
+    """Return those of `FEATURES` that this processor has."""
     try:
         words = set(Path("/proc/cpuinfo").read_text().split())
     except OSError:
@@ -64,7 +64,7 @@ def processor_features() -> list[str]:
 
 
 def _expected(preset: str) -> str:
-    """What training would bring, from timing its update and its step."""
+    """Return the expected training speed, from timing a step and an update."""
     config = compose(preset, TASK)
     try:
         with Setup.prepare(config, new=False) as setup:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from rich.console import Console
 
 UNWRAPPED = 10_000
-"""Characters of a line where there is no terminal: files and pipes get whole lines."""
+"""Line width where the output is not a terminal, so that files and pipes get whole lines."""
 
 
 def make_console() -> Console:
-    """Return a console on stdout which wraps lines only on a terminal."""
+    """Return a console on stdout that wraps lines only on a terminal."""
     console = Console(markup=False, highlight=False)
     if not console.is_terminal:
         console.width = UNWRAPPED

@@ -1,4 +1,4 @@
-"""Reading the command line: tyro's parser, with its errors in one line."""
+"""Parse the command line with tyro and report its errors in one line."""
 
 from __future__ import annotations
 
@@ -19,11 +19,22 @@ T = TypeVar("T")
 
 
 def parse(target: Callable[..., T], prog: str, args: list[str], **options: Any) -> T:
-    """Tyro's parser, with its errors in one line."""
+    """Parse arguments with tyro.
+
+    Args:
+        target: the class or function that the flags are made from.
+        prog: the name of the command, for help and errors.
+        args: the arguments after the command's name.
+        options: further arguments of `tyro.cli`.
+
+    Raises:
+        MerlError: the arguments are invalid; the message is one line.
+    """
     try:
         return _parsed(target, prog, args, options)
     except MerlError as error:
-        # Tyro takes what follows an unknown flag for the flag's, and then finds it missing.
+        # Tyro takes the argument after an unknown flag as its value and then misses that argument.
+        # With one argument more, tyro names the unknown flag.
         if str(error).startswith("missing value for argument"):
             try:
                 _parsed(target, prog, ["x", *args], options)
@@ -39,7 +50,7 @@ def _parsed(target: Callable[..., T], prog: str, args: list[str], options: dict[
     asks_help = any(arg in ("-h", "--help") for arg in args)
     try:
         if not asks_help:
-            os.environ["COLUMNS"] = "1000"  # or the message would be broken into lines
+            os.environ["COLUMNS"] = "1000"  # tyro must not wrap the message
         with contextlib.redirect_stderr(errors):
             parsed: T = tyro.cli(target, prog=prog, args=args, **options)
             return parsed
@@ -55,10 +66,10 @@ def _parsed(target: Callable[..., T], prog: str, args: list[str], options: dict[
 
 
 def _one_line(box: str) -> str:
-    """The message of tyro's framed error, and the first flag that it thinks was meant.
+    """Return the message of tyro's framed error and the first flag that tyro suggests.
 
-    Rules part the frame; the title stands in the frame itself, or, where the terminal knows ASCII
-    alone, in a part of its own.
+    Horizontal rules divide the frame into parts. The title is in the frame's top line, or, on a
+    terminal with ASCII only, in its own part.
     """
     lines = [line.strip().strip("│|").strip() for line in box.splitlines()]
     parts: list[list[str]] = [[]]
@@ -80,33 +91,33 @@ def _one_line(box: str) -> str:
 
 
 def _choices(listed: re.Match[str]) -> str:
-    """The choices in order; None is no choice: a flag is left out, not set to it."""
+    """Return the choices in order, without None: None means that the flag is omitted."""
     names = sorted(set(re.findall(r"'([^']*)'", listed.group())) - {"None"})
     return f"({', '.join(map(repr, names))})"
 
 
 def check_writable(path: Path | None) -> None:
-    """See to it, before long work, that a file can be written that the user asked for.
+    """Check before a long computation that its output file can be written.
 
     Raises:
-        MerlError: it cannot.
+        MerlError: the file cannot be written.
     """
     if path is None:
         return
     try:
-        there = os.path.lexists(path)
+        existed = os.path.lexists(path)
         path.open("a").close()
-        if not there:
+        if not existed:
             path.unlink()
     except OSError as error:
         raise _unwritable(path, error) from None
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a file that the user asked for.
+    """Write a value to a JSON file.
 
     Raises:
-        MerlError: it cannot be written.
+        MerlError: the file cannot be written.
     """
     try:
         path.write_text(json.dumps(value, indent=1) + "\n")
@@ -116,5 +127,5 @@ def write_json(path: Path, value: Any) -> None:
 
 def _unwritable(path: Path, error: OSError) -> MerlError:
     return MerlError(
-        f"{path} cannot be written: {error.strerror}: name a file in a folder that is there"
+        f"{path} cannot be written: {error.strerror}: name a file in an existing folder"
     )

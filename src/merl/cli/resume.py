@@ -1,4 +1,4 @@
-"""merl resume."""
+"""The command merl resume."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from merl.runs.run import Run
 
 @dataclass(frozen=True)
 class ResumeOptions:
-    """Go on with a run from its last checkpoint."""
+    """Resume a run from its last checkpoint."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     steps: int | None = None
-    """Train to this many steps in all, in place of what the run was started with."""
+    """Train to this total number of steps; by default to the run's own --steps."""
     minutes: float | None = None
-    """Stop after this many minutes from now; if not set, only the steps count."""
+    """Stop after this many minutes from now; by default there is no time limit."""
     device: Literal["auto", "cpu", "cuda"] | None = None
-    """Where the networks live from now on; where they were, if not set."""
+    """Where the networks live from now on; by default where they were before."""
     trust: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Import the environment that the run names, although you have not trained this run here: that
-    runs the code of whoever made the run."""
+    """Import the environment that the run names, although you have not trained this run here. This
+    runs the code of the run's author."""
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
@@ -38,7 +38,7 @@ class ResumeOptions:
 
 
 def resume(args: list[str]) -> int:
-    """Go on with a run: merl resume RUN [--steps N] [--minutes N]."""
+    """Resume a run: merl resume RUN [--steps N] [--minutes N]."""
     options = parse(ResumeOptions, "merl resume", args)
     run = Run.open(options.run)
     asked = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""A run from the command line: what is told before it, and after it."""
+"""Start or resume a run from the command line; print its outlook and its result."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ DAY = 86_400.0  # seconds
 
 
 def begin(config: TrainConfig, what: str) -> int:
-    """Train a new run to its end; returns the exit code.
+    """Train a new run to its end; return the exit code.
 
     Args:
-        config: of the run.
-        what: it is, for the first line.
+        config: the config of the run.
+        what: a description of the run, for the first printed line.
     """
     return _train(config, what)
 
@@ -46,18 +46,18 @@ def go_on(
     trusted: bool = False,
     named_in: Path | None = None,
 ) -> int:
-    """Train a run from its last whole checkpoint to its end; returns the exit code.
+    """Resume a run from its last intact checkpoint and train it to its end; return the exit code.
 
     Args:
         run: the run.
-        asked: the config with which it continues; fields that are left open keep their values.
-        given_open: fields that the user has left open by name, as with `--agent.precision auto`.
-        trusted: the environment that the run names may be imported; see `Run.load_module`.
-        named_in: the folder in which the user has named the task.
+        asked: the requested config; fields that it leaves open keep their recorded values.
+        given_open: fields that the user explicitly left open, as with `--agent.precision auto`.
+        trusted: whether the environment that the run names may be imported; see `Run.load_module`.
+        named_in: the folder in which the user named the task.
 
     Raises:
-        MerlError: that would be another run, another process trains it, it has nothing to go on
-            from, or its environment is not trusted.
+        MerlError: the config would make it another run, another process trains it, its checkpoint
+            or replay is missing, or its environment is not trusted.
     """
     if asked.device == "auto" and "device" in given_open:
         asked = dataclasses.replace(asked, device=device_name("auto"))
@@ -77,7 +77,8 @@ def go_on(
     with run.lock():
         run.load_module(trusted=trusted, named_in=named_in)
         if run.begin_again():
-            return _train(config, f"run {run.path} was ended before its first step", (run, None))
+            what = f"run {run.path}, which was stopped before its first step, starts again"
+            return _train(config, what, (run, None))
         start = Checkpoint.find(run.checkpoints)
         with readable(start):
             state = start.state()
@@ -86,20 +87,22 @@ def go_on(
             raise MerlError(f"--steps {config.steps} is less than the {start.step:,} already taken")
         if start.step >= config.steps and (not config.eval.every or evaluated == start.step):
             steps = f"{start.step:,} of {counted(config.steps, 'step')}"
-            print(f"{run.path} is done: {steps}; --steps N takes it further")
+            print(f"{run.path} is done: {steps}; --steps N trains it further")
             return 0
         if not run.replay.is_dir():
-            raise MerlError(f"{run.replay} is gone, and without its replay a run cannot go on")
-        what = f"run {run.path} goes on at step {start.step:,}"
+            raise MerlError(
+                f"{run.replay} is gone: without it the run can be evaluated, not resumed"
+            )
+        what = f"run {run.path} resumes at step {start.step:,}"
         if is_open:
-            what += " (it was stopped in an episode, and begins a new one)"
+            what += " (it was stopped within an episode; a new one begins)"
         if changes:
             what += f" with {', '.join(changes)}"
         return _train(config, what, (run, start))
 
 
 def tell_trusted(run: Run) -> None:
-    """Say which code `--trust` is going to import."""
+    """Print which code `--trust` imports."""
     origin = run.origin()
     if origin is not None:
         print(f"merl: --trust: importing {origin}", file=sys.stderr)
@@ -117,13 +120,13 @@ def _train(
             done = resumed[1].step if resumed and resumed[1] else 0
             console.print(_outlook(trainer.setup, what, done), highlight=False)
             outcome = trainer.fit()
-        except KeyboardInterrupt:  # from there on a signal is a wish, see `Interrupt`
+        except KeyboardInterrupt:  # during training, `Interrupt` defers signals
             console.print("stopped before training began: nothing was written")
             raise
     folder = outcome.run.path
     if outcome.signal is not None:
         check_saved(outcome)
-        console.print(f"stopped at step {outcome.progress.step:,} and saved: go on with")
+        console.print(f"stopped at step {outcome.progress.step:,} and saved: resume with")
         console.print(f"    {resume_line(folder)}", highlight=False, soft_wrap=True)
         return 128 + outcome.signal
     try:
@@ -137,10 +140,10 @@ def _train(
 
 
 def check_saved(outcome: Outcome) -> None:
-    """Report what of a run's end is not on the disk.
+    """Check that the end of a run is saved.
 
     Raises:
-        NotSaved: naming what is missing, its last checkpoint, or rows of its metrics.
+        NotSaved: its last checkpoint or rows of its metrics are not on the disk.
     """
     run, rows = outcome.run, outcome.unwritten
     lost = [] if outcome.saved else ["its checkpoint"]
@@ -158,7 +161,7 @@ def check_saved(outcome: Outcome) -> None:
 
 
 def _scale(config: TrainConfig) -> dict[str, float]:
-    """The returns that the live view shows beside the agent's; none for an unknown environment."""
+    """Return the reference returns for the live view; none for an unknown environment."""
     return {
         reference.name: reference.returns.mean
         for reference in references(config.task, config.evaluated.env)
@@ -167,25 +170,25 @@ def _scale(config: TrainConfig) -> dict[str, float]:
 
 
 def _outlook(setup: Setup, what: str, done: int) -> str:
-    """Return what is going to happen, and how long it will take on this machine."""
+    """Return lines that describe the run: its duration, inputs, speed and memory."""
     config, timing = setup.config, setup.timing
     size = replay_bytes(
         config.replay, setup.space, setup.action_space, config.capacity, config.num_envs
     )
-    tried = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
-    seen = not config.own_env and any(is_image(space) for space in setup.space.values())
-    pictures = f" ({config.env.renderer} pictures)" if seen else ""
+    updates = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
+    has_images = not config.own_env and any(is_image(space) for space in setup.space.values())
+    images = f" ({config.env.renderer} images)" if has_images else ""
     lines = [f"{what}: {duration(config, timing, done)}"]
     if timing.seconds(config, done) > DAY and config.preset != "laptop":
-        lines.append("that is beyond a day: --preset laptop is made for a machine like this one")
+        lines.append("that is more than a day: --preset laptop is made for a machine like this one")
     lines += key_lines(config, setup.env)
-    step = "a step" if timing.knows_env else "a step, without the environment's part"
+    step = "ms per step" if timing.knows_env else "ms per step, without the environment"
     lines += [
-        f"an update takes {tried}; acting takes {1000 * timing.step:.1f} ms {step}{pictures}",
+        f"an update takes {updates}; acting takes {1000 * timing.step:.1f} {step}{images}",
         f"the replay takes {decimal(size)} for {counted(config.capacity, 'step')}",
     ]
     if timing.not_compiled is not None:
-        lines.append(f"updates are not compiled, which fails here: {timing.not_compiled}")
+        lines.append(f"updates are not compiled because compiling fails: {timing.not_compiled}")
     if (config.steps - config.seed_steps) * config.updates_per_step < 1:
         lines.append(
             "nothing will be learnt: the first update comes after "

@@ -1,4 +1,4 @@
-"""What a run came to: its return among what it is to be compared with, the curve, the video."""
+"""The summary of a run: its return beside references, its learning curve and its video."""
 
 from __future__ import annotations
 
@@ -18,46 +18,44 @@ from merl.runs.run_folder import resume_line
 from merl.training.trainer import Outcome
 
 FLOORS = (RANDOM, "no motion")
-"""The references that need no skill."""
+"""References that need no skill."""
 ENOUGH = 5
-"""Episodes of an evaluation, below which its interval says nothing."""
+"""Fewest evaluation episodes that can show that the agent has learnt."""
 
 
 def summarize(outcome: Outcome, console: Console) -> None:
-    """Print the table, draw the curve, say plainly what was learnt, and how to go on.
+    """Print the table, draw the curve, print whether the agent has learnt and how to resume.
 
-    The run is saved. What fails here costs one line, and the rest is still printed.
+    The run is already saved. If a part of the summary fails, print one line and continue.
     """
     run, trained = outcome.run, outcome.evaluation
-    from merl.report.figures import learning_curve  # here, for Matplotlib is slow to import
+    from merl.report.figures import learning_curve  # Matplotlib imports slowly
 
-    beside = references(run.config.task, run.config.evaluated.env)
-    if trained is not None and not beside and run.config.eval.references:
-        with console.status(
-            f"what {' and '.join(FLOORS)} are paid, to compare with", spinner="line"
-        ):
-            beside = _measured(run.config, console, trained.success_end is not None)
+    known = references(run.config.task, run.config.evaluated.env)
+    if trained is not None and not known and run.config.eval.references:
+        with console.status(f"measuring returns of {' and '.join(FLOORS)}", spinner="line"):
+            known = _measured(run.config, console, trained.success_end is not None)
     if trained is not None:
         console.print()
-        console.print(comparison(run.config.task, trained, beside))
-    lines = {reference.name: reference.returns.mean for reference in beside}
+        console.print(comparison(run.config.task, trained, known))
+    lines = {reference.name: reference.returns.mean for reference in known}
     try:
         curve = learning_curve(run.path, run.path / "curve.png", references=lines)
         console.print(f"learning curve: {curve}", highlight=False, soft_wrap=True)
-    except Exception as error:  # of matplotlib, too
+    except Exception as error:  # Matplotlib's errors too
         console.print(f"the curve was not drawn: {_reason(error)}", highlight=False)
     videos = sorted(run.videos.glob("*.mp4")) if run.videos.is_dir() else []
     if videos:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
     if trained is not None:
-        console.print(_verdict(beside, trained, outcome.progress.updates), highlight=False)
+        console.print(_verdict(known, trained, outcome.progress.updates), highlight=False)
     elif outcome.saved:
         console.print(
             f"{run.path} is trained and saved, and not evaluated", highlight=False, soft_wrap=True
         )
-    console.print(_way_on(outcome), highlight=False, soft_wrap=True)
+    console.print(_resume_hint(outcome), highlight=False, soft_wrap=True)
     console.print(
-        f"(its replay, {run.replay}, is only needed to go on, and may be deleted otherwise)",
+        f"(its replay, {run.replay}, is only needed to resume; you may delete it otherwise)",
         highlight=False,
         soft_wrap=True,
         style="dim",
@@ -67,7 +65,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
 def floors(
     config: TrainConfig, episodes: int = 20, *, reports_success: bool = False
 ) -> tuple[Reference, ...]:
-    """Random actions, and none (the middle of their range), from the evaluation's starts."""
+    """Measure random actions and no motion (the middle of the range) from the fixed starts."""
     env = make_run_env(config.evaluated)
     rng = np.random.default_rng(0)
     shape = env.action_space.shape
@@ -90,11 +88,11 @@ def floors(
     )
 
 
-def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> Table:
-    """What was trained among its references."""
-    table = Table("", "return", "success at the end", "from", title=task)
+def comparison(task: str, trained: Evaluation, known: Sequence[Reference]) -> Table:
+    """Return a table with the results of the references and of the trained agent."""
+    table = Table("", "return", "success at the end", "source", title=task)
     episodes = counted(len(trained.episodes), "episode")
-    rows = [*beside, Reference("trained", trained.returns, trained.success_end, episodes)]
+    rows = [*known, Reference("trained", trained.returns, trained.success_end, episodes)]
     for row in rows:
         returns = f"{row.returns.mean:.1f}"
         if row.returns.low < row.returns.high:
@@ -110,7 +108,7 @@ def comparison(task: str, trained: Evaluation, beside: Sequence[Reference]) -> T
 def _measured(
     config: TrainConfig, console: Console, reports_success: bool
 ) -> tuple[Reference, ...]:
-    """What can be measured of the references that need no skill; the run is over in any case."""
+    """Return the measured `FLOORS`; if that fails, print one line and return none."""
     try:
         return floors(config, reports_success=reports_success)
     except Exception as error:
@@ -119,40 +117,41 @@ def _measured(
 
 
 def _reason(error: Exception) -> str:
-    """An exception in one line."""
+    """Return an exception as one line."""
     return str(error) if isinstance(error, MerlError) else in_one_line(error)
 
 
-def _verdict(beside: Sequence[Reference], trained: Evaluation, updates: int) -> str:
-    """Whether anything was learnt, as far as the intervals allow to say.
+def _verdict(known: Sequence[Reference], trained: Evaluation, updates: int) -> str:
+    """Return whether the agent has learnt anything, as far as the intervals show it.
 
-    Doing nothing can be paid more than acting at random.
+    The comparison is with the better of `FLOORS`: no motion can have a higher return than random
+    actions.
     """
     if updates == 0:
         return "Nothing was learnt: there was no update."
-    lower = [row for row in beside if row.name in FLOORS]
+    lower = [row for row in known if row.name in FLOORS]
     if not lower:
         return (
-            "Whether it has learnt cannot be said: there is nothing to compare with "
+            "It is unknown whether the agent has learnt: there is nothing to compare with "
             "(--eval.references takes 20 episodes each of random actions and of no motion)."
         )
     floor = max(lower, key=lambda row: row.returns.high)
     if trained.returns.low <= floor.returns.high:
         return (
-            "It is too early to say that it has learnt: its return is not clearly above that of "
-            f"{floor.name}."
+            "It is too early to say that the agent has learnt: its return is not clearly above "
+            f"that of {floor.name}."
         )
     if len(trained.episodes) < ENOUGH:
         episodes = counted(len(trained.episodes), "episode")
         return (
-            f"Its return lies above that of {floor.name}, but {episodes} cannot show that it has "
-            "learnt: evaluate more (--eval.episodes)."
+            f"The agent's return is above that of {floor.name}, but {episodes} cannot show that it "
+            "has learnt: evaluate more (--eval.episodes)."
         )
-    return f"It has begun to learn: its return lies clearly above that of {floor.name}."
+    return f"The agent has begun to learn: its return is clearly above that of {floor.name}."
 
 
-def _way_on(outcome: Outcome) -> str:
+def _resume_hint(outcome: Outcome) -> str:
     run, step = outcome.run, outcome.progress.step
     if step < run.config.steps:
-        return f"go on with: {resume_line(run.path)}"
-    return f"go on with: {resume_line(run.path)} --steps {2 * run.config.steps}"
+        return f"resume with: {resume_line(run.path)}"
+    return f"resume with: {resume_line(run.path)} --steps {2 * run.config.steps}"

@@ -1,4 +1,4 @@
-"""merl tasks."""
+"""The command merl tasks."""
 
 from __future__ import annotations
 
@@ -18,39 +18,39 @@ from merl.envs import make_env
 from merl.envs.registration import ENV_IDS
 from merl.tasks import BOX_TASKS, TASKS
 
-PICTURE_WIDTH = 40  # characters
-PICTURE_SIZE = 480  # pixels, of the files
+IMAGE_WIDTH = 40  # characters
+IMAGE_SIZE = 480  # pixels; height and width of the files
 START = 3
-"""The seed of the start that is shown: arm and object are both in view."""
+"""Seed of the start state that is shown, with arm and object in view."""
 
 
 def tasks(args: list[str]) -> int:
-    """What there is to learn, with a picture of each task."""
+    """List the tasks, with an image of each."""
 
     def command(pictures: Path | None = None) -> Path | None:
-        """List the tasks that come with merl, with a picture of each.
+        """List the tasks that come with merl, with an image of each.
 
         Args:
-            pictures: Also write the pictures into this folder, as PNG files.
+            pictures: Also write the images to this folder, as PNG files.
         """
         return pictures
 
     folder = parse(command, "merl tasks", args)
     console = make_console()
     for name in TASKS:
-        picture = _picture(name)
-        console.print(_entry(name, picture, console), highlight=False)
-        for line in _to_paste(name):
+        image = _image(name)
+        console.print(_entry(name, image, console), highlight=False)
+        for line in _commands(name):
             console.print(line, highlight=False, soft_wrap=True)
         console.print()
         if folder is not None:
             path = folder / f"{name}.png"
-            _write(path, picture)
-            console.print(f"picture: {path}\n", highlight=False, soft_wrap=True)
+            _write(path, image)
+            console.print(f"image: {path}\n", highlight=False, soft_wrap=True)
     return 0
 
 
-def _entry(name: str, picture: NDArray[np.uint8], console: Console) -> Table:
+def _entry(name: str, image: NDArray[np.uint8], console: Console) -> Table:
     about = (TASKS[name].__doc__ or "").strip().splitlines()[0]
     terms = TASKS[name]().term_names
     lines = [
@@ -59,19 +59,19 @@ def _entry(name: str, picture: NDArray[np.uint8], console: Console) -> Table:
         Text(f"reward: {' + '.join(terms)}, in [0, 1]; 250 steps of 0.04 s"),
     ]
     entry = Table.grid(padding=(0, 2))
-    shows_pictures = (
+    shows_image = (
         console.color_system is not None
         and "utf" in (console.encoding or "").lower()
-        and console.width >= 2 * PICTURE_WIDTH
+        and console.width >= 2 * IMAGE_WIDTH
     )
-    entry.add_row(*([_blocks(picture)] if shows_pictures else []), Group(*lines))
+    entry.add_row(*([_blocks(image)] if shows_image else []), Group(*lines))
     return entry
 
 
-def _to_paste(name: str) -> list[str]:
-    """Return lines that work as they are, on any machine, with what each is for.
+def _commands(name: str) -> list[str]:
+    """Return lines of code that work on any machine, each after a line that says where to paste it.
 
-    Preset `laptop` is named because `paper`, the default beside CUDA, needs OpenGL.
+    They name preset `laptop`, because `paper`, the default on a machine with CUDA, needs OpenGL.
     """
     lines = [
         "in Python:",
@@ -81,14 +81,14 @@ def _to_paste(name: str) -> list[str]:
     ]
     if name in BOX_TASKS:
         lines += [
-            "and with a disc that hides the object:",
+            "in a shell, with a disc that hides the object:",
             f"    merl train {name} --preset laptop --occluded",
         ]
     return lines
 
 
-def _picture(name: str) -> NDArray[np.uint8]:
-    env = make_env(name, renderer="raster", image_size=PICTURE_SIZE, observations=("image",))
+def _image(name: str) -> NDArray[np.uint8]:
+    env = make_env(name, renderer="raster", image_size=IMAGE_SIZE, observations=("image",))
     try:
         image: NDArray[np.uint8] = env.reset(seed=START)[0]["image"]
         return image
@@ -96,10 +96,10 @@ def _picture(name: str) -> NDArray[np.uint8]:
         env.close()
 
 
-def _blocks(picture: NDArray[np.uint8]) -> Text:
-    """A square picture in characters: each shows two pixels, one above the other."""
-    side = PICTURE_WIDTH
-    small = np.asarray(Image.fromarray(picture).resize((side, side), Image.Resampling.BOX))
+def _blocks(image: NDArray[np.uint8]) -> Text:
+    """Return a square image as text: each character shows two pixels, one above the other."""
+    side = IMAGE_WIDTH
+    small = np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BOX))
     text = Text()
     for upper, lower in zip(small[::2], small[1::2], strict=True):
         for top, bottom in zip(upper, lower, strict=True):
@@ -112,9 +112,9 @@ def _rgb(pixel: NDArray[np.uint8]) -> str:
     return ",".join(str(value) for value in pixel)
 
 
-def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+def _write(path: Path, image: NDArray[np.uint8]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(path)
+        Image.fromarray(image).save(path)
     except OSError as error:
         raise MerlError(f"{path} cannot be written: {error.strerror or error}") from None

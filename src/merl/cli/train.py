@@ -1,4 +1,4 @@
-"""merl train."""
+"""The command merl train."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class TrainOptions:
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Go on with the run in --run-dir, if there is one: the same line begins a run and goes on with
-    it, as jobs that may be stopped at any time need it."""
+    """Resume the run in --run-dir if there is one, else start it. A job that may be stopped at any
+    time can be submitted again with the same command."""
 
 
 def train(args: list[str]) -> int:
@@ -45,17 +45,17 @@ def train(args: list[str]) -> int:
             if getattr(config.env, field.name) != getattr(default.env, field.name)
         ]
         raise MerlError(
-            f"{', '.join(changed)} is for merl's own tasks: {config.task} decides for itself how "
-            "it is seen"
+            f"{', '.join(changed)} is for merl's own tasks: {config.task} defines its own "
+            "observations"
         )
     if not config.own_env and config.user_env != default.user_env:
         raise MerlError(
-            f"--env.image-layout and --env.allow-wide-actions are for an environment of your own: "
-            f"leave them out for {config.task}"
+            "--env.image-layout and --env.allow-wide-actions are for your own environment: "
+            f"omit them for {config.task}"
         )
     if options.resume:
         if config.run_dir is None:
-            raise MerlError("--resume needs --run-dir: which run is to go on?")
+            raise MerlError("--resume needs --run-dir: name the folder of the run to resume")
         if (config.run_dir / CONFIG_FILE).exists():
             closed = decided(compose(preset, task, agent, setting))
             given_open = {*left_open(_parse(args, closed).config)} - {*left_open(closed)}
@@ -68,17 +68,17 @@ def _parse(args: list[str], default: TrainConfig) -> TrainOptions:
 
 
 def _choose_preset(args: list[str]) -> tuple[str, str]:
-    """The preset's name and why it is this one."""
+    """Return the preset's name and the reason for the choice."""
     name = _given(args, "--preset")
     if name is not None:
-        return name, "as asked for"
+        return name, "as requested"
     if torch.cuda.is_available():
-        return "paper", "CUDA is there"
-    return "laptop", "no CUDA here"
+        return "paper", "CUDA is available"
+    return "laptop", "CUDA is not available"
 
 
 def _given(args: list[str], flag: str) -> str | None:
-    """What a flag is given, before the whole line is parsed; of two, the last one counts."""
+    """Return the value of a flag, before all arguments are parsed; the last occurrence counts."""
     for index, arg in reversed(list(enumerate(args))):
         if arg == flag and index + 1 < len(args):
             return args[index + 1]

@@ -1,6 +1,6 @@
-"""How an agent sees a task: Gymnasium environments, and the renderers behind them.
+"""Gymnasium environments for the tasks, and their renderers.
 
-Importing this is cheap; the simulator is loaded when the first environment is made.
+Importing this package is fast; it loads the simulator when the first environment is made.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ __all__ = ["EnvConfig", "make_env"]
 
 
 def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> JacoEnv:
-    """An environment for a task.
+    """Make the environment of a task.
 
     Args:
-        task: a name of `merl.tasks.TASKS`.
-        render_mode: `rgb_array` for `env.render()` to return pictures.
+        task: a key of `merl.tasks.TASKS`.
+        render_mode: with `rgb_array`, `env.render()` returns images.
         **config: the fields of `EnvConfig`: `renderer`, `image_size`, `occluded`, ...
 
     Returns:
         The environment, not yet reset; see `merl.envs.jaco_env.JacoEnv`.
 
     Raises:
-        MerlError: the task or a setting is unknown, the renderer does not work here, or the
-            simulator has the wrong version.
+        MerlError: the task or a setting is unknown, the renderer does not work on this machine, or
+            the simulator has the wrong version.
     """
     known = [field.name for field in fields(EnvConfig)]
     for name in config:

@@ -1,4 +1,4 @@
-"""Every action held for some steps, as DrQ-v2 does."""
+"""Action repeat: apply every action for several steps, as DrQ-v2 does."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from merl.envs.frame_rate import frame_rate
 
 
 class ActionRepeat(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An action is held until it was taken `repeat` times or the episode is over.
+    """A wrapper that applies each action `repeat` times, or until the episode ends.
 
-    Rewards and the terms of the reward are summed; what else `info` tells is the last step's.
+    Rewards and reward terms are summed. All other entries of `info` are those of the last step.
 
     Args:
-        env: whose steps are repeated.
-        repeat: how many of its steps make one of this.
+        env: the environment whose steps are repeated.
+        repeat: number of its steps in one step of the wrapper.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], repeat: int) -> None:
         super().__init__(env)
         self.repeat = repeat
         fps = frame_rate(env.metadata)
-        if fps is not None:  # videos of it stay in real time
+        if fps is not None:  # videos keep real time
             self.metadata = {**env.metadata, "render_fps": fps / repeat}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:

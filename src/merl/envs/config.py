@@ -1,4 +1,4 @@
-"""How an environment is seen: which renderer, which picture, which senses."""
+"""Configs of environments: renderer, images, observations, starts and rewards."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from merl.core import MerlError, check_choice
 RendererName = Literal["gl", "raster"]
 RendererChoice = Literal["auto", "gl", "raster"]
 AUTO_RENDERER: RendererName = "raster"
-"""The renderer that `auto` stands for: the one that works on every machine, and the faster one
-where both were measured (docs/bench.md). It does not depend on the machine, so the same code sees
-the same images everywhere."""
+"""The renderer that replaces `auto`. It works on every machine, and is the faster one where both
+were measured (docs/bench.md). It does not depend on the machine, so the same code gives the same
+images everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding", "carrying"]
@@ -28,58 +28,58 @@ REMOVED = {
     "reward 'both'": "reward paper or staged",
     "floor 'smooth'": "the rough floor",
 }
-"""Values of earlier versions, which runs may have recorded, and what replaces them."""
+"""Values of earlier versions, which recorded runs may have, and their replacements."""
 
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """How an environment is seen."""
+    """Settings of an environment."""
 
     renderer: RendererChoice = "auto"
-    """What draws the images: `gl` (OpenGL, as dm_control does) or `raster` (a z-buffer that needs
-    no OpenGL and is much faster on a CPU). To an agent they are different cameras. `auto` is
-    replaced by `raster`."""
+    """Renderer of the images: `gl` (OpenGL, as in dm_control) or `raster` (a z-buffer that needs no
+    OpenGL and is much faster on a CPU). Their images differ: to an agent they are different
+    cameras. `auto` selects `raster`."""
 
     image_size: int = 84
-    """Height and width of the agent's picture, in pixels; from 16 to 2048."""
+    """Height and width of the agent's image, in pixels; from 16 to 2048."""
 
     samples: int = 1
-    """Samples along each edge of a pixel of the agent's image, 1 to 4, for renderer `raster`; a
-    pixel is their average. An image takes as long as one of `samples` times its size: 24 pixels
-    with 3 samples as long as 72 with 1."""
+    """Samples along each edge of a pixel of the agent's image, 1 to 4, for renderer `raster`. A
+    pixel is the mean of its samples. An image takes as long as one of `samples` times the size: 24
+    pixels with 3 samples take as long as 72 pixels with 1."""
 
     proprio: ProprioName = "paper"
-    """What the robot feels: `paper` (angles and velocities of arm and fingers, 24 numbers) or
+    """Content of `proprio`: `paper` (angles and velocities of arm and fingers, 24 numbers) or
     `full` (also joint torques and the hand's position and rotation, 42 numbers)."""
 
     state: StateName = "absolute"
-    """What `state` holds: `absolute` (`full` proprioception, the object's pose and velocities, the
-    target) or `relative` (also the ways from hand to object and from object to target)."""
+    """Content of `state`: `absolute` (`full` proprioception, the object's pose and velocities, the
+    target) or `relative` (also the vectors from hand to object and from object to target)."""
 
     observations: tuple[str, ...] = ("image", "proprio")
-    """What an observation holds: any of `image`, `proprio`, `state`. The rest is not computed."""
+    """Keys of an observation: any of `image`, `proprio`, `state`. Other keys are not computed."""
 
     occluded: bool = False
-    """Put a disc between camera and object, for `move_box` and `lift_box`: what the camera does not
-    see, the joints have to tell."""
+    """Put a disc between the camera and the object, for `move_box` and `lift_box`. Where the camera
+    does not see the object, the agent needs proprioception."""
 
     start: tuple[StartName, ...] = ("above",)
-    """Where the hand starts: `above` (20 to 40 cm over the floor) or, for `move_box` and
-    `lift_box`, `around` (its open fingers around the box), `holding` (closed around it) or
-    `carrying` (closed around it, anywhere on the way to the target). Of several, one is drawn in
-    each episode."""
+    """Where the hand starts: `above` (20 to 40 cm above the floor) or, for `move_box` and
+    `lift_box`, `around` (open fingers around the box), `holding` (closed around the box) or
+    `carrying` (closed around the box, anywhere on the way to the target). With several, each
+    episode draws one."""
 
     reward: RewardName = "paper"
     """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5) or `staged` (the authors' later
-    code: one more term for the last centimetre)."""
+    code, with one more term for the last centimetre)."""
 
     render_size: int = 480
-    """Height and width of the pictures for people (videos), in pixels; from 16 to 2048."""
+    """Height and width of the images in videos, in pixels; from 16 to 2048."""
 
     def __post_init__(self) -> None:
         check_not_removed("renderer", self.renderer)
         check_choice("renderer", self.renderer, get_args(RendererChoice))
-        if self.renderer == "auto":  # a config, and so a run's record, names what really draws
+        if self.renderer == "auto":  # so a config and a run's record name the real one
             object.__setattr__(self, "renderer", AUTO_RENDERER)
         check_choice("proprio", self.proprio, get_args(ProprioName))
         check_choice("state", self.state, get_args(StateName))
@@ -110,15 +110,15 @@ class EnvConfig:
 
 
 def check_not_removed(name: str, value: str) -> None:
-    """Reject a value that earlier versions of merl had.
+    """Reject a value that only earlier versions of merl accept.
 
     Raises:
-        MerlError: naming the value and the way out.
+        MerlError: naming the value and its replacement.
     """
     removed = f"{name} {value!r}"
     if removed in REMOVED:
         raise MerlError(
-            f"{removed} no longer exists: train anew with {REMOVED[removed]}, or use the version "
+            f"{removed} no longer exists: train again with {REMOVED[removed]}, or use the version "
             "of merl that the run was trained with"
         )
 
@@ -136,7 +136,7 @@ def check_whole(name: str, value: int, least: int, most: int) -> None:
 
 
 def check_samples(samples: int, size: int) -> None:
-    """Reject samples per pixel edge that are out of range for an image of `size` pixels an edge.
+    """Reject a number of samples per pixel edge that is out of range for an image of `size` pixels.
 
     Raises:
         MerlError: naming the value and the bounds.
@@ -152,11 +152,11 @@ def check_samples(samples: int, size: int) -> None:
 
 @dataclass(frozen=True)
 class UserEnvConfig:
-    """How the spaces of a user's own environment are read."""
+    """How the spaces of a user's environment are interpreted."""
 
     image_layout: ImageLayout = "auto"
     """Order of the axes of the environment's images: `hwc` (height, width, channels), `chw`
-    (channels, height, width), or `auto`, which recognises the channels by their number."""
+    (channels, height, width), or `auto`, which recognises the channel axis by its size."""
 
     allow_wide_actions: bool = False
     """Accept actions whose bounds are more than 1,000,000 apart."""

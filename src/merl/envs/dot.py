@@ -1,9 +1,9 @@
-"""A small task whose optimum is known: steer a dot to a mark, by camera and joints.
+"""A toy task with a known optimum: steer a dot to a mark, with a camera and joint positions.
 
-Learnt in a minute or two, it tells whether an agent works, and what each sense is good for:
+Agents learn it in a minute or two. It shows whether an agent works, and how it uses each modality:
 
     merl.envs.dot:whole   the camera sees dot and mark
-    merl.envs.dot:split   it sees the mark alone: where the dot is, the joints know
+    merl.envs.dot:split   the camera sees only the mark; the joints give the position of the dot
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 SIZE = 32
-"""Height and width of the picture, pixels."""
+"""Height and width of the image, pixels."""
 REACH = 0.2
-"""How far the dot moves in a step at most, along each axis of a plane from -1 to 1."""
+"""Maximum motion of the dot in one step, along each axis of a plane from -1 to 1."""
 EPISODE_STEPS = 20
 NEAR = 0.1
-"""Success: the dot is this near to the mark, along both axes."""
-_WIDTH = 4  # of dot and mark, pixels
+"""Success: the dot is closer to the mark than this, along both axes."""
+_WIDTH = 4  # width of dot and mark, pixels
 
 
 class SteerDot(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
-    """The dot and the mark start at random; an action (2,) in [-1, 1] moves the dot by up to 0.2.
+    """A dot that an agent steers to a mark; both start at random positions.
 
-    An observation is `image`, uint8 (32, 32, 3), the mark in green and the dot in red, and
-    `joints`, float32 (2,), where the dot is. The reward is 1 - d / 2, d in [0, 2] the greater of
-    the distances along the two axes; what is best is to go straight (`best_action`). An episode has
-    20 steps.
+    An action (2,) in [-1, 1] moves the dot by up to 0.2 along each axis. An observation has
+    `image`, uint8 (32, 32, 3), with the mark in green and the dot in red, and `joints`, float32
+    (2,), the position of the dot. The reward is 1 - d / 2, where d in [0, 2] is the larger one of
+    the distances along the two axes. The best policy moves straight to the mark (`best_action`). An
+    episode has 20 steps.
 
     Args:
         shows_dot: whether the camera sees the dot.
@@ -73,34 +74,34 @@ class SteerDot(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observe(), 1.0 - distance / 2, False, self._step == EPISODE_STEPS, info
 
     def best_action(self) -> NDArray[np.float32]:
-        """Straight to the mark: no policy is paid more."""
+        """Return the action straight to the mark: no policy gets a higher reward."""
         way = (self._mark - self._dot) / REACH
         best: NDArray[np.float32] = np.clip(way, -1.0, 1.0).astype(np.float32)
         return best
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Dot and mark, whether the camera sees both or not."""
-        return None if self.render_mode is None else self._picture(shows_dot=True)
+        """Return an image of dot and mark, even if the camera does not see the dot."""
+        return None if self.render_mode is None else self._image(shows_dot=True)
 
     def _observe(self) -> dict[str, Any]:
         return {
-            "image": self._picture(self._shows_dot),
+            "image": self._image(self._shows_dot),
             "joints": self._dot.astype(np.float32),
         }
 
-    def _picture(self, shows_dot: bool) -> NDArray[np.uint8]:
-        picture = np.zeros((SIZE, SIZE, 3), np.uint8)
+    def _image(self, shows_dot: bool) -> NDArray[np.uint8]:
+        image = np.zeros((SIZE, SIZE, 3), np.uint8)
         for position, channel in ((self._mark, 1), (self._dot, 0))[: 1 + shows_dot]:
             row, column = np.round((position + 1) / 2 * (SIZE - _WIDTH)).astype(int)
-            picture[row : row + _WIDTH, column : column + _WIDTH, channel] = 255
-        return picture
+            image[row : row + _WIDTH, column : column + _WIDTH, channel] = 255
+        return image
 
 
 def whole(render_mode: str | None = None) -> SteerDot:
-    """The camera sees dot and mark."""
+    """Make the task in which the camera sees dot and mark."""
     return SteerDot(render_mode=render_mode)
 
 
 def split(render_mode: str | None = None) -> SteerDot:
-    """The camera sees the mark, the joints know where the dot is."""
+    """Make the task in which the camera sees only the mark; the joints give the dot's position."""
     return SteerDot(shows_dot=False, render_mode=render_mode)

@@ -1,4 +1,4 @@
-"""The tasks' experts as policies: they act in an environment as a trained agent would."""
+"""Experts as policies: they act in an environment in the same way as a trained agent."""
 
 from __future__ import annotations
 
@@ -14,27 +14,29 @@ from merl.tasks.expert import Expert
 
 
 class ExpertPolicy:
-    """Solves an environment's task from the simulator's state; the observation is not looked at.
+    """A policy that solves a task from the simulator's state and ignores the observation.
 
-    Call `reset()` before every episode, then the policy with each observation in turn.
+    Call `reset()` before every episode, then call the policy with each observation.
 
     Args:
-        env: a `JacoEnv`, wrapped or not; its actions must reach it as they are.
+        env: a `JacoEnv`, wrapped or not; wrappers must not change the actions.
 
     Raises:
-        MerlError: it is another environment.
+        MerlError: the environment is not a `JacoEnv`.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         jaco = env.unwrapped
         if not isinstance(jaco, JacoEnv):
-            raise MerlError(f"there is no expert for {jaco}: it solves the tasks of merl.tasks")
+            raise MerlError(
+                f"there is no expert for {jaco}: experts only solve the tasks of merl.tasks"
+            )
         self._env = jaco
         self._expert = Expert(jaco.task, jaco.physics)
         self._fresh = True
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Start a new plan, for a new episode."""
         self._fresh = True
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
@@ -43,7 +45,7 @@ class ExpertPolicy:
         Raises:
             MerlError: the environment is closed.
         """
-        if self._expert.physics is not self._env.physics:  # it was closed and opened again
+        if self._expert.physics is not self._env.physics:  # the environment was closed and reset
             self._expert, self._fresh = Expert(self._env.task, self._env.physics), True
         if self._fresh:
             self._expert.reset()

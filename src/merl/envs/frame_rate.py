@@ -1,4 +1,4 @@
-"""The frame rate of an environment's videos, as its `metadata` states it."""
+"""Frame rate of an environment's videos, from its `metadata`."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 SLOWEST, FASTEST = 0.1, 1000.0
-"""Frames a second that a video can be written and played with."""
+"""Frames per second with which a video can be written and played."""
 
 
 def frame_rate(metadata: Any) -> float | None:
     """Return `render_fps` in frames a second; None if it is not a usable positive number."""
     try:
         rate = metadata.get("render_fps") if isinstance(metadata, Mapping) else None
-    except Exception:  # a mapping of the user's own
+    except Exception:  # the user's mapping may raise anything
         return None
     if isinstance(rate, np.ndarray) and rate.size == 1:
         rate = rate.item()

@@ -1,4 +1,4 @@
-"""A task as a Gymnasium environment with a `Dict` observation, a key per modality."""
+"""Gymnasium environment of a task, with a `Dict` observation that has one key per modality."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ Observation = dict[str, Any]
 
 
 class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """One task of the Jaco arm, as an agent sees it.
+    """A Gymnasium environment for one task of the Jaco arm.
 
-    An observation is a dict of what `EnvConfig.observations` names: `image` uint8 (H, W, 3),
+    An observation is a dict with the keys in `EnvConfig.observations`: `image` uint8 (H, W, 3),
     `proprio` float32 (24,) or (42,), `state` float32 (n,). An action is float32 (9,) in [-1, 1]:
-    the velocities of the arm's six joints and of the three fingers, as shares of the greatest.
+    the velocities of the arm's six joints and of the three fingers, as fractions of their maximum.
 
-    An episode is 250 steps of 0.04 s and ends by truncation. `info` holds, after each step,
-    `success` (1.0 if the task is solved at this moment, else 0.0), `distance` (what success is
-    measured by, m) and `reward_terms` (by name; they sum to the reward, which is in [0, 1]).
+    An episode has 250 steps of 0.04 s and ends by truncation. After each step, `info` holds
+    `success` (1.0 if the task is solved in the current state, else 0.0), `distance` (the distance
+    that decides success, m) and `reward_terms` (by name; their sum is the reward, in [0, 1]).
 
-    Its only random state is Gymnasium's `np_random`: where that is set back between two episodes,
-    the same episodes follow.
+    The only random state is Gymnasium's `np_random`: if it is restored between two episodes, the
+    same episodes follow.
 
     Attributes:
-        task: what is to be solved.
-        config: how it is seen.
+        task: the task to solve.
+        config: the settings of the environment.
     """
 
     metadata = {  # noqa: RUF012
@@ -59,10 +59,10 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode at random; after `close()` this opens the environment again.
+        """Start a random episode; after `close()`, open the environment again.
 
         Args:
-            seed: with it, the start depends on the seed alone, whatever was done before.
+            seed: if given, the start depends only on the seed, not on earlier episodes.
             options: not used.
 
         Returns:
@@ -79,21 +79,21 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Act for 0.04 s.
+        """Apply an action for 0.04 s.
 
         Args:
-            action: (9,); what lies outside [-1, 1] is clipped.
+            action: (9,); values outside [-1, 1] are clipped.
 
         Returns:
             Observation, reward in [0, 1], terminated (always False), truncated (True at the 250th
             step), and `info`.
 
         Raises:
-            MerlError: the action has another shape or is not finite, or no episode is under way;
-                nothing has moved then.
+            MerlError: the action has the wrong shape or is not finite, or no episode is running.
+                The simulation is then unchanged.
         """
         if self._steps_left == 0:
-            raise MerlError("no episode is under way: call reset() first")
+            raise MerlError("no episode is running: call reset() first")
         self._physics.set_control(self._velocities(action))
         self._physics.step(self.task.physics_steps_per_control_step)
         self._steps_left -= 1
@@ -102,17 +102,17 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observe(), sum(terms.values()), False, truncated, self._info(terms)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a picture for people, uint8 (render_size, render_size, 3), by the agent's camera.
+        """Return an image for videos, uint8 (render_size, render_size, 3), from the agent's camera.
 
         Raises:
             MerlError: the environment is closed.
         """
         if self._physics is None:
             raise MerlError("the environment is closed: call reset() first")
-        return None if self.render_mode is None else self._picture(self.config.render_size)
+        return None if self.render_mode is None else self._image(self.config.render_size)
 
     def close(self) -> None:
-        """Free renderers and physics until the next `reset()`; may be called twice."""
+        """Free renderers and physics until the next `reset()`; repeated calls have no effect."""
         while self._renderers:
             self._renderers.popitem()[1].close()
         if self._physics is not None:
@@ -121,7 +121,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def physics(self) -> Any:
-        """The simulation, a dm_control `mjcf.Physics`; `reset()` after `close()` makes another.
+        """The simulation, a dm_control `mjcf.Physics`; `reset()` after `close()` makes a new one.
 
         Raises:
             MerlError: the environment is closed.
@@ -133,18 +133,18 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _compile(self) -> Any:
         """Compile the task's simulation."""
         physics = self.task.compile()
-        buffer = physics.model.vis.global_  # OpenGL's, which has to hold every picture
+        buffer = physics.model.vis.global_  # OpenGL's buffer must hold every image
         buffer.offwidth = buffer.offheight = max(self.config.image_size, self.config.render_size)
         return physics
 
     def action_for(self, velocities: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The action that asks for velocities of the joints: (9,), rad/s, to (9,), in [-1, 1]."""
+        """Return the action (9,), in [-1, 1], for velocities of the joints (9,), rad/s."""
         shares = (velocities - self._action_center) / self._action_scale
         action: NDArray[np.float32] = shares.clip(-1.0, 1.0).astype(np.float32)
         return action
 
     def _velocities(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Target velocities of the joints, (9,), rad/s."""
+        """Return the target velocities of the joints for an action, (9,), rad/s."""
         try:
             given = np.asarray(action)
             values = given.astype(np.float64) if given.dtype.kind in "fiu" else None
@@ -154,7 +154,9 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             shown = " ".join(repr(action).split())
             raise MerlError(f"action {shown} is not an array of numbers")
         if values.shape != self.action_space.shape:
-            raise MerlError(f"action has shape {values.shape}: {self.action_space.shape} is needed")
+            raise MerlError(
+                f"action has shape {values.shape}: it must have {self.action_space.shape}"
+            )
         if not np.isfinite(values).all():
             raise MerlError(f"action {values.tolist()} is not finite: give numbers in [-1, 1]")
         velocities: NDArray[np.float64] = self._action_center + self._action_scale * values.clip(
@@ -166,7 +168,7 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         wanted = self.config.observations
         observation: Observation = {}
         if "image" in wanted:
-            observation["image"] = self._picture(self.config.image_size, self.config.samples)
+            observation["image"] = self._image(self.config.image_size, self.config.samples)
         if "proprio" in wanted:
             observation["proprio"] = self.task.proprio(self._physics, self.config.proprio)
         if "state" in wanted:
@@ -180,8 +182,8 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "reward_terms": terms,
         }
 
-    def _picture(self, size: int, samples: int = 1) -> NDArray[np.uint8]:
-        """An image of the scene, uint8 (size, size, 3)."""
+    def _image(self, size: int, samples: int = 1) -> NDArray[np.uint8]:
+        """Return an image of the scene, uint8 (size, size, 3)."""
         if (size, samples) not in self._renderers:
             renderer = make_renderer(
                 self.config.renderer, self._physics, CAMERA.name, size, samples
@@ -191,9 +193,9 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 def _observation_space(config: EnvConfig, state_size: int) -> spaces.Space[Observation]:
-    picture = (config.image_size, config.image_size, 3)
+    image_shape = (config.image_size, config.image_size, 3)
     everything: dict[str, spaces.Space[Any]] = {
-        "image": spaces.Box(0, 255, picture, np.uint8),
+        "image": spaces.Box(0, 255, image_shape, np.uint8),
         "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO_SIZES[config.proprio],), np.float32),
         "state": spaces.Box(-np.inf, np.inf, (state_size,), np.float32),
     }

@@ -1,4 +1,4 @@
-"""Pictures by OpenGL: `renderer="gl"`, and which library draws them."""
+"""Renderer with OpenGL (`renderer="gl"`), and the choice of the OpenGL library."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from merl.tasks import simulator
 
 
 class GlRenderer:
-    """OpenGL through dm_control: what its camera observables show.
+    """A renderer that uses OpenGL through dm_control, with the images of its camera observables.
 
-    The thread that takes the first picture of a physics has to take them all.
+    The thread that draws the first image of a physics must draw all of them.
     """
 
     def __init__(self, physics: Any, camera: str, size: int) -> None:
@@ -32,7 +32,7 @@ class GlRenderer:
         return np.array(self._camera.render(), dtype=np.uint8)
 
     def close(self) -> None:
-        """Free the scene; the OpenGL context goes with the physics."""
+        """Free the scene; the OpenGL context is freed with the physics."""
         if self._camera is not None:
             self._camera._scene.free()
         self._camera = None
@@ -46,10 +46,10 @@ _opengl_lock = threading.Lock()
 
 
 def enable_opengl() -> None:
-    """Give dm_control, which was imported without, an OpenGL backend.
+    """Enable an OpenGL backend in dm_control, which was imported without one.
 
     Raises:
-        MerlError: there is none, or it does not work.
+        MerlError: no backend is found, or it does not work.
     """
     render = importlib.import_module("dm_control._render")
     name = _choose_opengl()
@@ -58,20 +58,20 @@ def enable_opengl() -> None:
             return
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of GLFW, while the reason is told below
+                warnings.simplefilter("ignore")  # the error below gives the reason
                 _reload_opengl(name)
                 _try_opengl(render)
-        except Exception as reason:  # every backend fails in its own way
+        except Exception as reason:  # every backend raises other exceptions
             _reload_opengl("disabled")
             raise MerlError(
-                f"renderer 'gl' finds no OpenGL that works (tried {name}): install the Debian "
-                "package libegl1, or libosmesa6 and set MUJOCO_GL=osmesa, or use --renderer "
-                "raster, which needs none"
+                f"renderer 'gl' found no OpenGL library that works (tried {name}): install the "
+                "Debian package libegl1, or libosmesa6 and set MUJOCO_GL=osmesa, or use --renderer "
+                "raster, which needs no OpenGL"
             ) from reason
 
 
 def _try_opengl(render: Any) -> None:
-    """Make a context to draw in: GLFW fails no earlier.
+    """Create an OpenGL context, because GLFW does not fail earlier.
 
     Raises:
         Exception: OpenGL does not work.
@@ -87,9 +87,9 @@ def _try_opengl(render: Any) -> None:
 
 
 def _choose_opengl() -> str:
-    """The backend that `MUJOCO_GL` names, else the first whose library is there.
+    """Return the backend in `MUJOCO_GL`, else the first one whose library is installed.
 
-    One choice and no second try: what a backend has loaded keeps the next one from working.
+    There is no second attempt: the libraries of one backend prevent the next one from working.
     """
     if os.environ.get("MUJOCO_GL"):
         return os.environ["MUJOCO_GL"]

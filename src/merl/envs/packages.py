@@ -1,4 +1,4 @@
-"""Which Python package brings a Gymnasium environment that is not installed here."""
+"""Python packages that provide Gymnasium environments, for advice on how to install them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ class Package(NamedTuple):
     """A package that registers environments with Gymnasium when it is imported."""
 
     name: str
-    """What pip installs."""
+    """Name for pip."""
     module: str
-    """What Python imports."""
+    """Name for import."""
     ids: str
-    """A regular expression that the ids of its environments begin with."""
+    """Regular expression that matches the start of its environments' ids."""
 
 
 PACKAGES = (
@@ -38,17 +38,17 @@ PACKAGES = (
 
 
 def installing(env_id: str, module: str | None = None) -> str | None:
-    """Return how to get an environment; None if no known package has such a one.
+    """Return advice on how to install an environment; None if no known package provides it.
 
     Args:
-        env_id: its Gymnasium id.
-        module: the module that should register it, if one is named.
+        env_id: Gymnasium id of the environment.
+        module: the module that should register the environment, if the user named one.
     """
     for package in PACKAGES:
         known_module = module is not None and module.split(".")[0] == package.module.split(".")[0]
         if known_module or (module is None and re.match(package.ids, env_id)):
             return (
                 f"it comes with the package {package.name}: pip install '{package.name}', then "
-                f"name it {package.module}:{env_id}"
+                f"use the task {package.module}:{env_id}"
             )
     return None

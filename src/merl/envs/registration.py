@@ -1,4 +1,4 @@
-"""The environments' names in Gymnasium; importing this touches neither torch nor the simulator."""
+"""Gymnasium ids of the tasks; importing this module loads neither torch nor the simulator."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ ENV_IDS = {
     "move_box": "merl/MoveBox-v0",
     "lift_box": "merl/LiftBox-v0",
 }
-"""Gymnasium's id of each task."""
+"""Gymnasium id of each task."""
 
 
 def register() -> None:
-    """Tell Gymnasium of the tasks; may be called twice."""
+    """Register the tasks with Gymnasium; repeated calls have no effect."""
     for task, env_id in ENV_IDS.items():
         if env_id not in registry:
             register_with_gymnasium(env_id, entry_point="merl.envs:make_env", kwargs={"task": task})

@@ -1,8 +1,8 @@
 """Images of the scene: two renderers behind one protocol.
 
-`gl` draws as dm_control does, pixel for pixel. `raster` draws triangles with Warp kernels of merl's
-own; it needs no OpenGL library, draws neither sites nor transparency nor reflections, and smooths
-edges only where `samples` is above 1. To an agent they are different cameras.
+`gl` gives exactly the pixels of dm_control. `raster` draws triangles with merl's Warp kernels: it
+needs no OpenGL library, draws no sites, transparency or reflections, and smooths edges only if
+`samples` is above 1. Their images differ: to an agent they are different cameras.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from merl.envs.raster.renderer import RasterRenderer
 
 
 class Renderer(Protocol):
-    """Takes square pictures of one simulation with one camera."""
+    """A renderer of square images of one simulation, from one camera."""
 
     def __init__(self, physics: Any, camera: str, size: int) -> None: ...
 
     def render(self) -> NDArray[np.uint8]:
-        """The scene as it stands, uint8 (size, size, 3), a new array each time."""
+        """Return the current scene, uint8 (size, size, 3), as a new array."""
         ...
 
     def close(self) -> None:
-        """Let go of what was taken; may be called twice."""
+        """Free the resources; repeated calls have no effect."""
         ...
 
 
@@ -37,14 +37,14 @@ def make_renderer(
     """Make a renderer by its name.
 
     Args:
-        name: `gl` or `raster`; `EnvConfig` has replaced `auto`.
-        physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
+        name: `gl` or `raster`; `EnvConfig` has already replaced `auto`.
+        physics: a `dm_control.mjcf.Physics`; its model is not changed.
         camera: the name of a camera in the model.
-        size: height and width of the pictures, in pixels.
-        samples: along each edge of a pixel, for `raster`; `EnvConfig` checks it.
+        size: height and width of the images, in pixels.
+        samples: samples along each edge of a pixel, for `raster`; `EnvConfig` checks the value.
 
     Raises:
-        MerlError: `gl`, and no OpenGL library works; `raster`, and a geom cannot be drawn.
+        MerlError: for `gl`, no OpenGL library works; for `raster`, a geom cannot be drawn.
     """
     if name == "raster":
         return RasterRenderer(physics, camera, size, samples)
@@ -52,10 +52,10 @@ def make_renderer(
 
 
 def check_renderer(name: RendererChoice) -> None:
-    """Make sure that a renderer works here, before anything is built on it.
+    """Check that a renderer works on this machine.
 
     Raises:
-        MerlError: `gl`, and no OpenGL library works.
+        MerlError: for `gl`, no OpenGL library works.
     """
     if name == "gl":
         enable_opengl()

@@ -1,4 +1,4 @@
-"""A user's own environment, brought into the form that agents take: any robot, any senses."""
+"""Import and make a user's environment, and convert it to the form that agents use."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from merl.envs.registration import ENV_IDS
 from merl.envs.wrappers import adapt, failing, in_one_line
 
 BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
-"""Tasks in the form module:function that come with merl."""
+"""Tasks in the form module:function that are part of merl."""
 CLOSE = 0.8
-"""How similar an unknown id must be to a known one to be a mistyped form of it."""
+"""Minimum similarity at which an unknown id counts as a misspelling of a known one."""
 
 
 def make_user_env(
     task: str, render_mode: str | None = None, config: UserEnvConfig | None = None
 ) -> gymnasium.Env[Any, Any]:
-    """An environment that merl does not bring along, in the form that agents take.
+    """Make an environment that is not part of merl, in the form that agents use.
 
     Args:
-        task: a Gymnasium id (`Pendulum-v1`, `module:Id-v0`), or `module:function`, the function
-            being called without arguments, or with `render_mode` if it knows that.
-        render_mode: what is asked of it; where it cannot render, it is made without.
-        config: how its spaces are read.
+        task: a Gymnasium id (`Pendulum-v1`, `module:Id-v0`), or `module:function`. The function is
+            called without arguments, or with `render_mode` if it accepts that.
+        render_mode: requested render mode; an environment that cannot render is made without it.
+        config: how to interpret its spaces.
 
     Returns:
-        The environment, adapted (`Adapted`).
+        The environment, wrapped in `Adapted`.
 
     Raises:
-        MerlError: there is no such environment, or it cannot be learnt in.
+        MerlError: there is no such environment, or agents cannot learn in it.
     """
     env = _make(task, render_mode)
     if render_mode is not None and not _renders(env):
@@ -58,19 +58,20 @@ def make_user_env(
 
 
 def imports_code(task: str) -> bool:
-    """Whether making a task's environment runs code that comes neither with merl nor Gymnasium."""
+    """Return whether making a task's environment runs code from outside merl and Gymnasium."""
     if task in ENV_IDS or task in BUNDLED:
         return False
     if ":" in task:
         return True
-    spec = registry.get(task)  # an id that is not registered is refused before anything is imported
+    spec = registry.get(task)  # an unregistered id is rejected before any import
     return spec is not None and not str(spec.entry_point).startswith("gymnasium.envs.")
 
 
 def module_folder(task: str) -> Path | None:
-    """The folder from which the module of `module:function` or `module:Id-v0` was loaded.
+    """Return the folder from which the module of `module:function` or `module:Id-v0` was loaded.
 
-    None for a Gymnasium id without a module, and for a module that is installed: Python finds it.
+    Return None for a Gymnasium id without a module, and for an installed module, which Python finds
+    without the folder.
     """
     module, colon, _ = task.partition(":")
     file = _file_of(module.partition(".")[0]) if colon else None
@@ -83,20 +84,22 @@ def load_module(task: str, *folders: Path) -> ModuleType:
     """Import the module of `module:function` or `module:Id-v0`.
 
     Args:
-        task: names the module.
-        folders: where the module is looked for first. The one that has it is appended to
-            `sys.path`, so that the module can import its neighbours, and everything else is found
-            where it was before.
+        task: the task that names the module.
+        folders: folders that are searched first. The folder with the module is appended to
+            `sys.path`, so that the module can import its neighbours, while all other imports are
+            found where they were before.
 
     Raises:
         MerlError: there is no such module, or it cannot be imported.
     """
     module = task.partition(":")[0]
     if not all(part.isidentifier() for part in module.split(".")):
-        raise MerlError(f"task {task!r}: write it as my_robot:make_env, for my_robot.py here")
+        raise MerlError(
+            f"task {task!r}: use module:function, for example my_robot:make_env for my_robot.py"
+        )
     try:
         if task not in BUNDLED:
-            set_value(users_value())  # it may start Python processes that need the folder
+            set_value(users_value())  # the module may start Python processes that need the folder
             any(_load_from(folder, module.partition(".")[0]) for folder in folders)
         return importlib.import_module(module)
     except MerlError:
@@ -104,12 +107,12 @@ def load_module(task: str, *folders: Path) -> ModuleType:
     except ModuleNotFoundError as error:
         if not f"{module}.".startswith(f"{error.name}."):
             raise MerlError(
-                f"task {task!r}: {module!r} imports {error.name!r}, which is not installed here"
+                f"task {task!r}: {module!r} imports {error.name!r}, which is not installed"
             ) from None
-        ring_index = " or ".join([*map(str, folders), "what is installed"])
+        searched = " or ".join([*map(str, folders), "the installed packages"])
         way = installing(task.partition(":")[2], module)
-        way = way or "name its folder in PYTHONPATH, or call `merl train` where it lies"
-        raise MerlError(f"task {task!r}: {error} in {ring_index}: {way}") from None
+        way = way or "add its folder to PYTHONPATH, or run `merl train` in its folder"
+        raise MerlError(f"task {task!r}: {error} in {searched}: {way}") from None
     except Exception as error:
         raise MerlError(
             f"task {task!r}: importing {module!r} failed: {in_one_line(error)}"
@@ -117,10 +120,10 @@ def load_module(task: str, *folders: Path) -> ModuleType:
 
 
 def _load_from(folder: Path, name: str) -> bool:
-    """Load a top-level module or package from a folder, whatever is installed.
+    """Load a top-level module or package from a folder, even if another one is installed.
 
     Returns:
-        Whether the folder has it.
+        Whether the folder has the module.
 
     Raises:
         MerlError: another module of that name is loaded already.
@@ -131,7 +134,7 @@ def _load_from(folder: Path, name: str) -> bool:
         return False
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
-    if spec.loader is None or spec.origin is None:  # no __init__.py: what is installed comes first
+    if spec.loader is None or spec.origin is None:  # no __init__.py: installed comes first
         return False
     if name not in sys.modules:
         module = sys.modules[name] = module_from_spec(spec)
@@ -142,14 +145,14 @@ def _load_from(folder: Path, name: str) -> bool:
             raise
     elif _file_of(name) != Path(spec.origin).resolve():
         raise MerlError(
-            f"{spec.origin} cannot be imported: {name!r} is the name of another module, "
-            f"{_file_of(name) or 'of Python itself'}; rename it"
+            f"{spec.origin} cannot be imported, because another module is named {name!r} "
+            f"({_file_of(name) or 'part of Python'}): rename the file"
         )
     return True
 
 
 def _file_of(name: str) -> Path | None:
-    """The file of a module that is loaded."""
+    """Return the file of a loaded module; None if it has none or is not loaded."""
     file = getattr(sys.modules.get(name), "__file__", None)
     return None if file is None else Path(file).resolve()
 
@@ -159,7 +162,7 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
     env_id = name if colon else task
     if env_id in ENV_IDS.values():
         known = next(task for task, known in ENV_IDS.items() if known == env_id)
-        raise MerlError(f"task {task!r} is merl's own: call it {known}")
+        raise MerlError(f"task {task!r} is a task of merl: use its name, {known}")
     if not colon:
         if task not in registry:
             way = installing(task) or suggest(task, [*ENV_IDS, *registry], CLOSE)
@@ -177,22 +180,22 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
             f"task {task!r}: module {module!r} has no function {name!r}, and registers no "
             f"environment of that name{f': {way}' if way.startswith('did') else ''}"
         )
-    env = _called(task, make, render_mode)
+    env = _call_function(task, make, render_mode)
     if not isinstance(env, gymnasium.Env):
-        raise MerlError(f"task {task!r} gave {type(env).__name__}, not a gymnasium.Env")
+        raise MerlError(f"task {task!r} returned {type(env).__name__}, not a gymnasium.Env")
     return env
 
 
-def _called(task: str, make: Any, render_mode: str | None) -> Any:
-    """What the function gives, told how to render if it knows that."""
+def _call_function(task: str, make: Any, render_mode: str | None) -> Any:
+    """Call the function with `render_mode` if it accepts that, and return its result."""
     try:
         signature = inspect.signature(make)
         given = {"render_mode": render_mode} if "render_mode" in signature.parameters else {}
         signature.bind(**given)
     except (TypeError, ValueError) as error:
         raise MerlError(
-            f"task {task!r}: a function is needed that makes an environment and takes no "
-            f"arguments, or render_mode alone ({error})"
+            f"task {task!r} must name a function that returns an environment and takes no "
+            f"arguments, or only render_mode ({error})"
         ) from None
     try:
         with failing(f"function {task.partition(':')[2]}"):
@@ -200,24 +203,25 @@ def _called(task: str, make: Any, render_mode: str | None) -> Any:
     except MerlError:
         if render_mode is None:
             raise
-        return _called(task, make, None)  # it may not know this way to render
+        return _call_function(task, make, None)  # it may not support this render mode
 
 
 def _renders(env: gymnasium.Env[Any, Any]) -> bool:
-    """Whether it draws; what it draws with may not be installed."""
+    """Return whether the environment renders; packages for rendering may be missing."""
     if env.render_mode is None:
         return False
     try:
         with failing("render"):
             env.reset(seed=0)
-            picture: Any = env.render()
+            image: Any = env.render()
     except MerlError as error:
-        warnings.warn(f"the environment cannot be filmed: {error}", stacklevel=1)
+        warnings.warn(f"videos of the environment are not possible: {error}", stacklevel=1)
         return False
-    usable = isinstance(picture, np.ndarray) and picture.dtype == np.uint8
-    if not usable or picture.ndim != 3 or picture.shape[2] != 3:
+    usable = isinstance(image, np.ndarray) and image.dtype == np.uint8
+    if not usable or image.ndim != 3 or image.shape[2] != 3:
         warnings.warn(
-            "the environment cannot be filmed: it does not render uint8 (H, W, 3)", stacklevel=1
+            "videos of the environment are not possible: render() does not return uint8 (H, W, 3)",
+            stacklevel=1,
         )
         return False
     return True
@@ -227,17 +231,17 @@ def _by_id(env_id: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
     if render_mode is not None:
         try:
             return gymnasium.make(env_id, render_mode=render_mode)
-        except Exception:  # it may not know this way to render
+        except Exception:  # it may not support this render mode
             return _by_id(env_id, None)
     try:
         return gymnasium.make(env_id)
     except ImportError as error:
         newest = _newest_version(env_id)
         way = (
-            "install what it needs; Gymnasium's own come with its extras, as pip install "
-            '"gymnasium[mujoco]"'
+            "install its packages; those of Gymnasium's environments are extras, for example pip "
+            'install "gymnasium[mujoco]"'
             if newest == env_id
-            else f"take its newest version, {newest}"
+            else f"use its newest version, {newest}"
         )
         reason = " ".join(str(error).split()).rstrip(".")
         raise MerlError(f"task {env_id!r} cannot be made: {reason}: {way}") from None

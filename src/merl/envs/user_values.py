@@ -1,6 +1,6 @@
-"""Values that a user's environment returns, checked and converted to plain Python and NumPy types.
+"""Check the values that a user's environment returns, and convert them to Python and NumPy types.
 
-Every function that refuses a value raises `EnvironmentFailed` with one line that names the value.
+Every function that rejects a value raises `EnvironmentFailed` with one line that names the value.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from merl.core import EnvironmentFailed
 
 _LONGEST = 80
-"""Characters of a value that a message shows."""
+"""Maximum number of characters of a value in a message."""
 
 
 def shown(value: Any) -> str:
-    """A value in one short line, for a message."""
+    """Return a value as one short line, for a message."""
     try:
         text = " ".join(repr(value).split())
     except Exception:  # the user's own __repr__ may fail
@@ -31,18 +31,18 @@ def to_array(name: str, value: Any) -> NDArray[Any]:
     """Convert a value to an array of numbers or booleans; tensors are copied to the host.
 
     Args:
-        name: what the value is, for the message.
+        name: name of the value, for the message.
         value: an array, a tensor of any device, a number, or nested lists of these.
 
     Raises:
-        EnvironmentFailed: NumPy cannot convert it, or it holds something other than real numbers.
+        EnvironmentFailed: NumPy cannot convert the value, or not all of it is real numbers.
     """
     try:
         try:
             array = np.asarray(value)
         except Exception:  # a tensor with gradients, or on another device
             array = np.asarray(_on_host(value))
-    except Exception as error:  # conversion is the code of whichever library made the value
+    except Exception as error:  # the library that made the value may raise anything
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise EnvironmentFailed(
             f"{name} cannot be converted to an array of numbers ({reason}): it is {shown(value)}"
@@ -54,7 +54,7 @@ def to_array(name: str, value: Any) -> NDArray[Any]:
     if array.dtype.kind == "O" and all(isinstance(part, Real) for part in array.flat):
         array = array.astype(np.float64)
     if array.dtype.kind not in "biuf":
-        raise EnvironmentFailed(f"{name} holds something that is not a number: {shown(value)}")
+        raise EnvironmentFailed(f"{name} contains a value that is not a number: {shown(value)}")
     return array
 
 
@@ -62,7 +62,7 @@ def to_number(name: str, value: Any) -> float:
     """Convert a number, or an array of exactly one, to a float.
 
     Raises:
-        EnvironmentFailed: it is something else.
+        EnvironmentFailed: the value has another form.
     """
     try:
         array = to_array(name, value)
@@ -82,7 +82,7 @@ def to_bool(name: str, value: Any) -> bool:
     """Convert a bool, 0, 1, or an array of exactly one of these, to a bool.
 
     Raises:
-        EnvironmentFailed: it is something else; a string or NaN would be true for Python.
+        EnvironmentFailed: the value has another form; Python would treat a string or NaN as true.
     """
     try:
         array = to_array(name, value)
@@ -96,12 +96,12 @@ def to_bool(name: str, value: Any) -> bool:
 
 
 def to_info(info: Any) -> dict[str, Any]:
-    """Copy `info`, with `success` as a bool and `reward_terms` as numbers, where it has them.
+    """Copy `info`, and convert `success` to a bool and `reward_terms` to numbers if present.
 
     `is_success` is another name for `success`; both may be a dict with the key `task`.
 
     Raises:
-        EnvironmentFailed: it is not a dict, or one of these has another form.
+        EnvironmentFailed: `info` is not a dict, or one of these entries has another form.
     """
     if not isinstance(info, Mapping):
         raise EnvironmentFailed(f"the environment's info is {shown(info)}: it must be a dict")
@@ -128,19 +128,19 @@ def _success(key: str, value: Any) -> bool:
     if isinstance(value, Mapping):
         if "task" not in value:
             raise EnvironmentFailed(
-                f"the environment's {name} is {shown(value)}: a dict needs the key 'task', true or "
-                "false"
+                f"the environment's {name} is {shown(value)}: a dict needs the key 'task' with "
+                "true or false"
             )
         name, value = f'{name}["task"]', value["task"]
     return to_bool(name, value)
 
 
 def _on_host(value: Any) -> Any:
-    """Replace torch tensors, also in lists, by arrays: without gradients, in the host's memory."""
+    """Replace torch tensors, also in lists, by arrays in host memory, without gradients."""
     if isinstance(value, list | tuple):
         return [_on_host(part) for part in value]
     if not callable(getattr(value, "detach", None)):
         return value
     tensor = value.detach().cpu()
-    # NumPy has no bfloat16; float32 holds each of its values.
+    # NumPy has no bfloat16; float32 represents all of its values exactly.
     return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()

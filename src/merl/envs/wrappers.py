@@ -1,4 +1,4 @@
-"""A user's environment in the form that agents take; what it returns is checked."""
+"""Wrapper that converts a user's environment to the form that agents use, and checks its values."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from merl.envs.user_values import shown, to_bool, to_info, to_number
 def adapt(
     env: gymnasium.Env[Any, Any], config: UserEnvConfig | None = None
 ) -> gymnasium.Env[Any, Any]:
-    """Bring an environment into the form that agents take.
+    """Convert an environment to the form that agents use.
 
-    A plain box of numbers becomes `state`, a plain image `image`; of a `Dict` the images (uint8
-    boxes) and vectors (boxes of one axis) stay, the rest is left out. A box of finite actions is
-    rescaled to [-1, 1]. `info["is_success"]` counts as `success`.
+    A plain box of numbers becomes `state`, and a plain image becomes `image`. From a `Dict`, images
+    (uint8 boxes) and vectors (boxes with one axis) are kept, and other keys are left out. A box of
+    actions with finite bounds is rescaled to [-1, 1]. `info["is_success"]` counts as `success`.
 
     Args:
         env: the user's environment.
-        config: how its spaces are read.
+        config: how to interpret its spaces.
 
     Raises:
-        MerlError: the actions are not a box of finite bounds, or no observation can be used.
+        MerlError: the actions are not a box with finite bounds, or no observation can be used.
     """
     for name in ("observation_space", "action_space"):
         if not isinstance(getattr(env, name, None), spaces.Space):
@@ -45,16 +45,17 @@ def adapt(
 
 
 class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Observations as a `Dict` of images and vectors, actions in [-1, 1].
+    """An environment with a `Dict` of images and vectors as observation, and actions in [-1, 1].
 
     Args:
-        env: its observations are a box or a `Dict` of boxes, its actions a finite box.
-        config: how its spaces are read.
+        env: an environment whose observations are a box or a `Dict`, and whose actions are a box
+            with finite bounds.
+        config: how to interpret its spaces.
 
     Attributes:
-        modalities: the observation keys that agents can use, with how each is converted.
-        left_out: the other keys, with the reason and the way out.
-        own_bounds: the environment's bounds of each action, lower and upper.
+        modalities: the observation keys that agents can use, each with its conversion.
+        left_out: the other keys, each with the reason and advice.
+        own_bounds: the environment's lower bounds and upper bounds of the actions.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], config: UserEnvConfig) -> None:
@@ -73,7 +74,7 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         for key, part in parts.items():
             if not isinstance(key, str):
                 raise MerlError(
-                    f"the environment's observation has the key {key!r}: name it with a string"
+                    f"the environment's observation has the key {key!r}: use a string as key"
                 )
             used = modality(key, part, config.image_layout)
             if used is None:
@@ -97,11 +98,12 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Start an episode; see `gymnasium.Env.reset`.
 
         Raises:
-            EnvironmentFailed: it raised an exception, or returned an invalid observation.
+            EnvironmentFailed: the environment raised an exception, or returned an invalid
+                observation.
         """
         with failing("reset"):
             given = self.env.reset(seed=seed, options=options)
-        observation, info = _apart("reset", given, ("observation", "info"))
+        observation, info = _unpacked("reset", given, ("observation", "info"))
         with failing("observation or info"):
             return self._adapted(observation), to_info(info)
 
@@ -109,15 +111,15 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Take an action in [-1, 1]; see `gymnasium.Env.step`.
 
         Raises:
-            MerlError: the action has another shape; the environment is not given it.
-            NotFinite: the action is not finite; the environment is not given it.
-            EnvironmentFailed: it raised an exception, or returned something invalid.
+            MerlError: the action has the wrong shape, and is not sent to the environment.
+            NotFinite: the action is not finite, and is not sent to the environment.
+            EnvironmentFailed: the environment raised an exception, or returned an invalid value.
         """
         wanted = self._scaled(action)
         with failing("step"):
             given = self.env.step(wanted)
         names = ("observation", "reward", "terminated", "truncated", "info")
-        observation, reward, terminated, truncated, info = _apart("step", given, names)
+        observation, reward, terminated, truncated, info = _unpacked("step", given, names)
         with failing("observation, reward or info"):
             over = to_bool("terminated", terminated), to_bool("truncated", truncated)
             return self._adapted(observation), to_number("reward", reward), *over, to_info(info)
@@ -126,13 +128,13 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         """See `gymnasium.Env.render`.
 
         Raises:
-            EnvironmentFailed: it raised an exception.
+            EnvironmentFailed: the environment raised an exception.
         """
         with failing("render"):
             return self.env.render()
 
     def close(self) -> None:
-        """Close it; that it cannot be closed is told, and stops nothing."""
+        """Close the environment; if that fails, warn and continue."""
         try:
             with failing("close"):
                 self.env.close()
@@ -140,16 +142,16 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
             warnings.warn(str(error), stacklevel=1)
 
     def _scaled(self, action: NDArray[np.float32]) -> NDArray[Any]:
-        """Rescale from [-1, 1] to the environment's own bounds, never beyond them."""
+        """Rescale an action from [-1, 1] to the environment's bounds, never beyond them."""
         share = (np.asarray(action, np.float64) + 1.0) / 2.0
         if share.shape != self._low.shape:
-            raise MerlError(f"action has shape {share.shape}: {self._low.shape} is needed")
+            raise MerlError(f"action has shape {share.shape}: it must have {self._low.shape}")
         wanted = (self._low + share * (self._high - self._low)).clip(self._low, self._high)
         scaled: NDArray[Any] = wanted.astype(self._dtype)
         if not (np.isfinite(wanted).all() and np.isfinite(scaled).all()):
             raise NotFinite(
-                f"the action is {shown(action)}, rescaled {shown(scaled)}: the environment is not "
-                "given it"
+                f"the action is {shown(action)}, rescaled {shown(scaled)}: it is not finite, and "
+                "not sent to the environment"
             )
         return scaled
 
@@ -157,8 +159,8 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         whole = observation if self._plain is None else {self._plain: observation}
         if not isinstance(whole, Mapping):
             raise EnvironmentFailed(
-                f"the environment's observation is of {type(whole).__name__}, but its space says a "
-                "dict"
+                f"the environment's observation is a {type(whole).__name__}, but its space is a "
+                "Dict"
             )
         for key in self.modalities:
             if key not in whole:
@@ -169,35 +171,35 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def _plain_key(space: spaces.Space[Any]) -> str:
-    """The key of an observation that has none."""
+    """Return the key for an observation that is not a `Dict`."""
     shape = space.shape or ()
     return "image" if space.dtype == np.uint8 and len(shape) - shape.count(1) > 1 else "state"
 
 
 @contextmanager
 def failing(what: str) -> Iterator[None]:
-    """What the user's code raises, in one line with its place there.
+    """Report exceptions of the user's code in one line, with the file and line in that code.
 
     Raises:
-        EnvironmentFailed: naming what was called.
+        EnvironmentFailed: naming the call that failed.
     """
     try:
         yield
     except MerlError:
         raise
-    except BaseException as error:  # drivers call sys.exit, bindings raise kinds of their own
+    except BaseException as error:  # drivers call sys.exit, bindings raise unusual kinds
         if isinstance(error, KeyboardInterrupt) and _ctrl_c_raises():
             raise
         raise EnvironmentFailed(f"the environment's {what} raised {in_one_line(error)}") from error
 
 
 def _ctrl_c_raises() -> bool:
-    """Whether a KeyboardInterrupt is the user's wish; elsewhere it is the environment's own."""
+    """Return whether Ctrl-C raises KeyboardInterrupt; else the environment itself raised it."""
     return signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def in_one_line(error: BaseException) -> str:
-    """An exception's kind and text, and the last place in the user's own files that led to it."""
+    """Return an exception's type and text, and the last line in the user's files that led to it."""
     try:
         text = " ".join(str(error).split())
     except Exception:  # the exception's own __str__ may fail
@@ -211,7 +213,7 @@ def in_one_line(error: BaseException) -> str:
 
 
 def _is_users(filename: str) -> bool:
-    """Whether code is in a file that exists, outside Python, installed packages and merl."""
+    """Return whether code is in an existing file outside Python, installed packages and merl."""
     path = Path(filename)
     if filename.startswith("<") or not path.is_file():
         return False
@@ -225,11 +227,11 @@ def _is_users(filename: str) -> bool:
     )
 
 
-def _apart(what: str, given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
-    """The tuple that a call returned, checked for its length."""
+def _unpacked(what: str, given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
+    """Check the length of the tuple that a call returned, and return the tuple."""
     if not isinstance(given, tuple) or len(given) != len(names):
         many = counted(len(given), "value") if isinstance(given, tuple) else type(given).__name__
         raise EnvironmentFailed(
-            f"the environment's {what} gave {many}: it must return {', '.join(names)}"
+            f"the environment's {what} returned {many}: it must return {', '.join(names)}"
         )
     return given

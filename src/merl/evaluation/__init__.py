@@ -1,1 +1,1 @@
-"""Evaluation of a policy, its videos, and policies of saved runs."""
+"""Evaluation of a policy, videos of its episodes, and policies of saved runs."""

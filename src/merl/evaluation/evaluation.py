@@ -1,4 +1,4 @@
-"""What an agent has learnt: it acts without noise, from starts that are the same every time."""
+"""Evaluation of a trained policy, without exploration noise and from fixed start states."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from merl.runs.checkpoint import Checkpoint, load_networks, readable
 from merl.runs.run import Run
 
 EVALUATION_SEED = 1_000_000
-"""Episode i of every evaluation starts from `env.reset(seed=EVALUATION_SEED + i)`."""
+"""Episode i of every evaluation starts with `env.reset(seed=EVALUATION_SEED + i)`."""
 
 Act = Callable[[Observation], NDArray[np.float32]]
 
 
 class Policy:
-    """A trained agent, ready to act on single observations; it stacks the frames itself.
+    """A trained agent that acts on single observations; it stacks the frames itself.
 
-    Call `reset()` at the start of every episode, then the policy with each observation in turn.
+    Call `reset()` at the start of each episode, then call the policy with each observation.
 
     Attributes:
-        config: of the run that it comes from.
-        step: environment steps after which it was saved.
-        reports_success: the environment was known to report success by then.
+        config: the config of its run.
+        step: environment steps at which the policy was saved.
+        reports_success: whether the environment was known to report success at that step.
     """
 
     def __init__(
@@ -66,22 +66,23 @@ class Policy:
         self._fresh = True
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Start a new episode: discard the stacked frames."""
         self._fresh = True
 
     def __call__(self, observation: Observation) -> NDArray[np.float32]:
-        """The action for an observation.
+        """Return the action for an observation.
 
         Args:
-            observation: as the environment gives it: images uint8 (H, W, C), vectors float (n,).
+            observation: an observation of the environment: images uint8 (H, W, C), vectors float
+                (n,).
 
         Returns:
-            float32 (A,), in [-1, 1].
+            The action, float32 (A,), in [-1, 1].
 
         Raises:
-            MerlError: a key is missing, has another shape or type than the agent was trained
-                with, or cannot be converted to an array.
-            NotFinite: it holds NaN or infinity.
+            MerlError: a key is missing, has another shape or type than in training, or cannot be
+                converted to an array.
+            NotFinite: the observation contains NaN or infinity.
         """
         sensed = {key: self._checked(key, observation) for key in self._modalities}
         if self._fresh:
@@ -94,29 +95,29 @@ class Policy:
         return result
 
     def make_env(self, *, trust: bool = False, **changes: Any) -> gymnasium.Env[Any, Any]:
-        """Make the environment that the agent was trained in, as its evaluations start it.
+        """Make the environment of the run, with the start states of its evaluations.
 
         Args:
-            trust: import the environment that the run names, although you have not trained this
-                run on this machine: that runs the code of whoever made the run. Not needed for
-                merl's own tasks and Gymnasium's.
-            **changes: fields of `EnvConfig`, and `render_mode`; the renderer `auto` is that of the
-                training.
+            trust: import the environment that the run names, although you have not trained this run
+                on this machine. This runs code of the author of the run. It is not needed for the
+                environments of merl and Gymnasium.
+            **changes: fields of `EnvConfig`, and `render_mode`; the renderer `auto` is the renderer
+                of the training.
 
         Raises:
-            MerlError: it is not trusted, cannot be made, or is no longer what the agent was
-                trained in.
+            MerlError: the environment is not trusted, cannot be made, or has other spaces than in
+                training.
         """
         renderer = changes.get("renderer", self.config.env.renderer)
         if renderer == "auto" and not self.config.own_env:
             renderer = changes["renderer"] = self.config.env.renderer
         if renderer != self.config.env.renderer and not self.config.own_env:
             warnings.warn(
-                f"the agent was trained with renderer {self.config.env.renderer!r} and sees "
-                f"{renderer!r} now: these pictures differ, and it may do worse",
+                f"the agent was trained with renderer {self.config.env.renderer!r} but now uses "
+                f"{renderer!r}: their images differ, and the agent may perform worse",
                 stacklevel=2,
             )
-            changes.setdefault("samples", 1)  # the trained renderer's alone
+            changes.setdefault("samples", 1)  # the recorded value is for that renderer
         if self._run is not None:
             self._run.load_module(trusted=trust)
         env = make_run_env(self.config.evaluated, **changes)
@@ -131,32 +132,32 @@ class Policy:
     def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
         if not isinstance(observation, Mapping):
             raise MerlError(
-                f"the observation is of {type(observation).__name__}: a dict with "
-                f"{list(self._modalities)} is needed"
+                f"the observation is a {type(observation).__name__}: give a dict with the keys "
+                f"{list(self._modalities)}"
             )
         if key not in observation:
             raise MerlError(
-                f"the observation lacks {key!r}: the agent consumes {list(self._modalities)}"
+                f"the observation lacks {key!r}: the agent needs {list(self._modalities)}"
             )
         value = self._modalities[key].convert(observation[key])
         if not np.isfinite(value).all():
-            raise NotFinite(f"observation {key!r} holds a NaN or an infinity: {value}")
+            raise NotFinite(f"observation {key!r} contains NaN or infinity: {value}")
         return value
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What came out of some episodes.
+    """The result of an evaluation.
 
     Attributes:
-        episodes: one by one, in the order of their seeds.
+        episodes: the episodes, in the order of their seeds.
         returns: the mean return with its bootstrap interval.
-        success_end: the rate of success at the last step, with Wilson's interval; None where the
-            environment does not report success.
-        success_any: likewise, at any step.
-        success_share: of the steps that report success or failure, the mean share of successes,
-            with its bootstrap interval.
-        starts: a digest of each episode's first observation.
+        success_end: the rate of episodes with success at the last step, with Wilson's interval;
+            None if the environment does not report success.
+        success_any: the same for success at any step.
+        success_share: the mean share of successes among the steps that report success or failure,
+            with its bootstrap interval; None if the environment does not report success.
+        starts: a digest of the first observation of each episode.
     """
 
     episodes: tuple[Episode, ...]
@@ -167,11 +168,11 @@ class Evaluation:
     starts: tuple[str, ...] = ()
 
     def starts_as(self, other: Evaluation) -> bool:
-        """Whether the episodes start as those of another evaluation, as far as both go."""
+        """Return whether the episodes that both evaluations have start with equal observations."""
         return all(mine == its for mine, its in zip(self.starts, other.starts, strict=False))
 
     def metrics(self) -> dict[str, float]:
-        """By name, as they stand in `metrics.csv` (behind `eval/`)."""
+        """Return the metrics by name; in `metrics.csv` each name has the prefix `eval/`."""
         values = {"episodes": float(len(self.episodes))}
         named = {
             "return": self.returns,
@@ -187,8 +188,8 @@ class Evaluation:
                     f"{name}_high": interval.high,
                 }
         for name in dict.fromkeys(name for episode in self.episodes for name in episode.terms):
-            told = [episode.terms.get(name, 0.0) for episode in self.episodes]
-            values[f"reward/{name}"] = float(np.mean(told))
+            terms = [episode.terms.get(name, 0.0) for episode in self.episodes]
+            values[f"reward/{name}"] = float(np.mean(terms))
         return values
 
 
@@ -204,19 +205,21 @@ def evaluate(
     max_steps: int = EvaluationConfig.max_episode_steps,
     reports_success: bool = False,
 ) -> Evaluation:
-    """Run episodes from the evaluation's starts; random generators are left as they were.
+    """Run episodes from the fixed start states of evaluations, and restore random generators.
 
     Args:
-        act: observation to action.
-        env: with `render_mode="rgb_array"` if there is to be a video.
-        episodes: how many.
+        act: maps an observation to an action.
+        env: the environment; for a video it needs `render_mode="rgb_array"`.
+        episodes: number of episodes.
         reset: called before each episode.
-        video: where to film the first episode.
-        tick: called after every step, with the number of the episode; may raise to end it.
-        warn: receives warnings (default: Python's). A video that cannot be made is a
-            warning; without `warn` it is an error.
-        max_steps: steps after which an episode is cut, as by a time limit, with a warning.
-        reports_success: the environment is known to report success, see `summarize`.
+        video: file for a video of the first episode; None for no video.
+        tick: called after every step with the index of the episode; may raise to end the
+            evaluation.
+        warn: receives warnings; if None, Python warnings are issued. If a video cannot be made,
+            `warn` receives the reason; without `warn` that is an error.
+        max_steps: limit in steps for episodes that do not end earlier; such an episode is
+            truncated with a warning.
+        reports_success: whether the environment is known to report success; see `summarize`.
 
     Raises:
         MerlError: the environment failed, or the video could not be made and `warn` is None.
@@ -241,12 +244,13 @@ def evaluate(
 
 
 def summarize(episodes: list[Episode], *, reports_success: bool = False) -> Evaluation:
-    """Means and intervals over episodes.
+    """Compute means and confidence intervals over episodes.
 
     Args:
-        episodes: one or more.
-        reports_success: the environment is known to report success: an episode without a report
-            failed. It is known in any case if one of these episodes has reported.
+        episodes: one or more episodes.
+        reports_success: whether the environment is known to report success, so that an episode
+            without a report counts as a failure. True in any case if one of these episodes has
+            reported success or failure.
     """
     reports, count = reports_success or report_success(episodes), len(episodes)
     return Evaluation(
@@ -266,7 +270,7 @@ def _run_episode(
     tick: Callable[[int], None],
     max_steps: int,
 ) -> tuple[Episode, str, bool]:
-    """Run one episode; return it, the digest of its start, and whether it ended by itself."""
+    """Run one episode; return it, a digest of its start, and whether it ended by itself."""
     episode, over = Episode(), False
     seed = EVALUATION_SEED + index
     seed_global_generators(seed)
@@ -285,7 +289,7 @@ def _run_episode(
             film.close()
     finally:
         if film is not None:
-            film.abort()  # without effect on one that is complete
+            film.abort()  # no effect on a finished video
     return episode, start, over
 
 
@@ -297,7 +301,7 @@ def _digest(observation: Observation) -> str:
 
 
 def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
-    """The check of an observation key that has the form which agents take already."""
+    """Return the check of an observation key that needs no conversion."""
     assert isinstance(space, spaces.Box)
     return Modality(key, space, space)
 
@@ -305,23 +309,23 @@ def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
 def load_policy(
     run: str | Path, *, checkpoint: str | int = "latest", threads: int | None = 1
 ) -> Policy:
-    """Load the policy that a run has learnt; no code of the run is imported or executed.
+    """Load the policy of a run; no code of the run is imported or executed.
 
     Args:
-        run: the run's folder.
-        checkpoint: "latest", "best" (by evaluation return), or a checkpoint's number of steps.
-        threads: processor threads that compute an action; None takes torch's own setting. For one
-            observation, several threads mostly wait for each other. Torch's setting for the rest
-            of the program is restored after each action.
+        run: the folder of the run.
+        checkpoint: "latest", "best" (by evaluation return), or the number of steps of a checkpoint.
+        threads: CPU threads that compute an action; None uses torch's setting. For a single
+            observation, several threads mostly wait for each other. Torch's setting for the rest of
+            the program is restored after each action.
 
     Raises:
-        MerlError: there is no run, or no whole checkpoint in it.
+        MerlError: there is no run or no complete checkpoint in it, or `threads` is not possible.
     """
     most = os.cpu_count() or 1
     if threads is not None and (type(threads) is not int or not 1 <= threads <= most):
         raise MerlError(
-            f"threads is {threads!r}: give None, or a whole number from 1 to {most}, which this "
-            "machine has"
+            f"threads is {threads!r}: give None, or an integer from 1 to {most}, the number of "
+            "CPUs of this machine"
         )
     opened = Run.open(Path(run))
     saved = Checkpoint.find(opened.checkpoints, str(checkpoint))

@@ -1,4 +1,4 @@
-"""The video of an episode, as the environment renders it."""
+"""The video of an episode, from the frames that the environment renders."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from merl.evaluation.video import FPS, Value, VideoWriter
 
 
 def warn_user(message: str) -> None:
-    """Warn by Python's means, at the caller of the caller."""
+    """Issue a Python warning at the caller of the caller."""
     warnings.warn(message, stacklevel=3)
 
 
 class EpisodeVideo:
-    """The video of an episode: a failure ends the video, and never the episode.
+    """The video of an episode; with `warn`, a failure ends the video but not the episode.
 
     Args:
-        path: where to write it.
-        env: is rendered for each frame.
-        warn: receives the reason of a failure; without it, a failure is an error.
+        path: the file to write.
+        env: the environment, rendered for each frame.
+        warn: receives the reason of a failure; if None, a failure raises an error.
     """
 
     def __init__(
@@ -40,42 +40,42 @@ class EpisodeVideo:
         if rate is None:
             (warn or warn_user)(
                 f"the environment's metadata has no usable render_fps: its videos have {FPS:g} "
-                "frames a second"
+                "frames per second"
             )
         self._writer: VideoWriter | None = None
-        with self._failing():
+        with self._handling_errors():
             self._writer = VideoWriter(path, fps=FPS if rate is None else rate)
 
     def add(self, episode: Episode) -> None:
-        """Append what the environment renders now, with the episode's numbers so far.
+        """Render the environment and append the frame, with the sums of the episode so far.
 
         Raises:
-            MerlError: the video cannot be made, and there is no `warn`.
+            MerlError: the video cannot be made and `warn` is None.
         """
         if self._writer is not None:
-            with self._failing():
+            with self._handling_errors():
                 self._writer.add(np.asarray(self._env.render()), _caption(episode))
 
     def close(self) -> None:
-        """Complete the video.
+        """Finish the video.
 
         Raises:
-            MerlError: the video cannot be made, and there is no `warn`.
+            MerlError: the video cannot be made and `warn` is None.
         """
         if self._writer is not None:
-            with self._failing():
+            with self._handling_errors():
                 self._writer.close()
 
     def abort(self) -> None:
-        """Remove a video that is not complete."""
+        """Remove the video if it is not finished."""
         if self._writer is not None:
             self._writer.abort()
 
     @contextmanager
-    def _failing(self) -> Iterator[None]:
+    def _handling_errors(self) -> Iterator[None]:
         try:
             yield
-        except Exception as error:  # of the user's `render`, of the encoder, of the disk
+        except Exception as error:  # from the user's `render`, the encoder or the disk
             self.abort()
             self._writer = None
             why = str(error) if isinstance(error, MerlError) else in_one_line(error)

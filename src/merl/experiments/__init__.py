@@ -1,1 +1,1 @@
-"""What is run: presets, and later the paper's figures as data."""
+"""Experiments: presets, and small tasks with a known optimum."""

@@ -1,4 +1,4 @@
-"""Presets: a name for a whole set of values. They only compose; every value can be overridden."""
+"""Presets: named sets of config values. Every value can be overridden."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
+import torch
 import tyro
 
 from merl.agents import AGENTS
@@ -21,15 +22,15 @@ _TASK: str = tyro.MISSING  # the command line asks for it
 
 @dataclass(frozen=True)
 class Preset:
-    """What a preset sets.
+    """Values of a preset.
 
     Attributes:
-        about: what it is for.
-        config: everything but the agent.
-        agent: what it changes of an agent's values, whichever agent it is.
-        agent_name: who learns, if nobody is named.
-        own_env: what it changes for a user's own environment, which may be a robot: there is one of
-            it, and its steps cost more than updates.
+        about: purpose of the preset, in one line.
+        config: all values except the agent's.
+        agent: values of the agent's config that differ from the agent's defaults, for every agent.
+        agent_name: the default agent.
+        own_env: values that differ for a user's own environment. It may be a robot: there is only
+            one, and its steps cost more than updates.
     """
 
     about: str
@@ -41,7 +42,7 @@ class Preset:
 
 PRESETS: dict[str, Preset] = {
     "paper": Preset(
-        "Table 1, OpenGL pictures: for a machine with CUDA",
+        "Table 1, OpenGL images: for a machine with CUDA",
         TrainConfig(_TASK, env=EnvConfig(renderer="gl")),
     ),
     "laptop": Preset(
@@ -108,12 +109,12 @@ PRESETS: dict[str, Preset] = {
 }
 
 HEAD_LAYERS = {"move_box": 6, "lift_box": 6}
-"""Layers of MERL's heads in preset `paper`, where the task wants others than three (MERL C.1)."""
+"""Layers of MERL's heads in preset `paper`, for tasks with other than three (MERL C.1)."""
 
 
 @dataclass(frozen=True)
 class Published:
-    """What an agent's authors ran it with.
+    """Values that an agent's authors used.
 
     Attributes:
         run: fields of `TrainConfig`.
@@ -127,14 +128,14 @@ class Published:
 
 
 PUBLISHED: dict[str, Published] = {
-    # Its own repository, for its tasks of medium difficulty: an action is held for two steps, an
-    # update every second decision, 2000 random decisions, noise that falls over 500,000 decisions.
+    # DrQ-v2's repository, for its tasks of medium difficulty: each action is held for two steps, an
+    # update every second action, 2000 random actions, noise that falls over 500,000 actions.
     "drqv2": Published(
         {"action_repeat": 2, "updates_per_step": 0.25, "random_steps": 4000, "seed_steps": 4000},
         {"batch_size": 256},
         {"noise_steps": 1_000_000},
     ),
-    # TD3's own repository, whose DDPG acts with noise and learns without.
+    # TD3's repository; its DDPG has noise in its actions and none in its updates.
     "ddpg": Published(
         {"updates_per_step": 1.0, "random_steps": 25_000, "seed_steps": 25_000},
         {"batch_size": 256, "n_step": 1},
@@ -146,27 +147,32 @@ PUBLISHED: dict[str, Published] = {
             "noise_clip": 0.0,
         },
     ),
-    # Haarnoja et al. 2018b, Table 1; its own repository begins with ten episodes at random.
+    # Haarnoja et al. 2018b, Table 1; SAC's repository begins with ten episodes of random actions.
     "sac": Published(
         {"updates_per_step": 1.0, "random_steps": 10_000, "seed_steps": 10_000},
         {"batch_size": 256, "n_step": 1},
         {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
     ),
 }
-"""What `--setting published` takes in place of the preset's values (docs/agents/)."""
+"""Values that replace the preset's with `--setting published` (docs/agents/)."""
+
+
+def default_preset() -> str:
+    """Return the preset for this machine: `paper` with CUDA, else `laptop`."""
+    return "paper" if torch.cuda.is_available() else "laptop"
 
 
 def compose(
     preset: str, task: str, agent: str | None = None, setting: Setting = "matched"
 ) -> TrainConfig:
-    """The values of a run before any of them is overridden.
+    """Return the config of a preset, task, agent and setting.
 
     Args:
         preset: a key of `PRESETS`.
-        task: what is to be learnt.
-        agent: a key of `AGENTS`; the preset's own, if not given.
-        setting: `matched`: the preset's values for the agent, which are MERL's; `published`: its
-            authors'.
+        task: the name of the task.
+        agent: a key of `AGENTS`; by default the preset's agent.
+        setting: `matched`: the preset's values for the agent, which are MERL's; `published`: the
+            values of the agent's authors.
 
     Raises:
         MerlError: the agent has no published setting, or a name is unknown.
@@ -179,26 +185,26 @@ def compose(
     config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
     if config.own_env:
         config = dataclasses.replace(config, **chosen.own_env)
-    else:  # a user's environment may be a robot, which nothing moves unasked
+    else:  # not for a user's environment: it may be a robot, which must not move unless asked
         evaluation = dataclasses.replace(config.eval, references=True)
         config = dataclasses.replace(config, eval=evaluation)
     values = dict(chosen.agent)
     base = AGENTS[name]
     if preset == "paper" and base.head_norm:
         values["head_layers"] = HEAD_LAYERS.get(task, base.head_layers)
-    if base.noise_std_end is not None:  # all of it within the run
+    if base.noise_std_end is not None:  # the noise falls within the run
         values["noise_steps"] = min(base.noise_steps, config.steps // 2)
     if setting == "published":
         if name not in PUBLISHED:
             raise MerlError(
-                f"agent {name!r} has no setting published: {', '.join(PUBLISHED)} have one; preset "
-                "paper has the paper's values"
+                f"agent {name!r} has no setting published: choose from {', '.join(PUBLISHED)}; for "
+                "the paper's values use preset paper"
             )
-        theirs = PUBLISHED[name]
-        replay = dataclasses.replace(config.replay, **theirs.replay)
-        config = dataclasses.replace(config, replay=replay, **theirs.run)
-        values = dict(theirs.agent)
-    if base.vectors and task not in ENV_IDS:  # `state` is a name of merl's own tasks
+        published = PUBLISHED[name]
+        replay = dataclasses.replace(config.replay, **published.replay)
+        config = dataclasses.replace(config, replay=replay, **published.run)
+        values = dict(published.agent)
+    if base.vectors and task not in ENV_IDS:  # only merl's own tasks have the key `state`
         values["vectors"] = None
     made = dataclasses.replace(base, **values)
     return dataclasses.replace(config, agent_name=name, agent=made)

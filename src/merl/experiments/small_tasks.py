@@ -1,7 +1,7 @@
-"""Small tasks whose answer is known: does an agent learn at all, and what is each sense good for?
+"""Small tasks with a known optimum: they show that an agent learns and which modalities it needs.
 
-Each is learnt in a few minutes on one core. `benchmarks/measure_small_tasks.py` runs them over
-seeds, the tests hold them to their bars.
+Each takes a few minutes on one core. `benchmarks/measure_small_tasks.py` runs them over seeds; the
+tests require minimum returns.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Precision = Literal["fp32", "bf16"]
 
 
 class Case(NamedTuple):
-    """An agent that learns a task for so many steps."""
+    """A task, an agent, and the number of steps that it trains."""
 
     task: str
     agent: str
@@ -44,7 +44,7 @@ CASES = (
     Case(PENDULUM, "ddpg", 20_000),
     Case(PENDULUM, "sac", 20_000),
 )
-"""What is shown in docs/small_tasks.md."""
+"""The cases of docs/small_tasks.md."""
 
 _SMALL: dict[str, Any] = {"hidden_dim": 128}
 _PENDULUM: dict[str, Any] = _SMALL | {"learning_rate": 1e-3}
@@ -55,11 +55,11 @@ _DOT: dict[str, Any] = _SMALL | {
     "shift_pad": 1,
 }
 _DOT_DISCOUNT = 0.8
-"""The mark is at most ten steps away; a longer horizon only makes the values slow to grow."""
+"""The mark is at most ten steps away; with a longer horizon the values only grow more slowly."""
 
 
 def small_config(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> TrainConfig:
-    """How an agent is trained on a small task, and how often it is evaluated on the way."""
+    """Return the config of a case, with `evaluations` evaluations during the run."""
     task, agent, steps, precision = case
     chosen = AGENTS[agent]
     values, discount = (_PENDULUM, 0.99) if task == PENDULUM else (_DOT, _DOT_DISCOUNT)
@@ -86,7 +86,7 @@ def small_config(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) 
 
 
 def learn(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> Evaluation:
-    """Train, and evaluate over 20 episodes without noise; all evaluations are in its metrics."""
+    """Train, with evaluations of 20 episodes without noise; return the last evaluation."""
     config = small_config(case, seed=seed, run_dir=run_dir, evaluations=evaluations)
     with Trainer(config) as trainer:
         outcome = trainer.fit()
@@ -95,7 +95,7 @@ def learn(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> Eval
 
 
 def returns_of(act: Callable[[Any], Any], task: str, episodes: int = 20) -> list[float]:
-    """What acting so is paid, from the evaluation's starts; `act` is given the environment."""
+    """Return the return of each episode with actions `act(env)`, from the fixed start states."""
     env = make_user_env(task)
     returns = []
     for index in range(episodes):
@@ -110,5 +110,5 @@ def returns_of(act: Callable[[Any], Any], task: str, episodes: int = 20) -> list
 
 
 def optimum(task: str) -> float:
-    """The mean return of going straight to the mark."""
+    """Return the mean return of moving straight to the mark."""
     return float(np.mean(returns_of(lambda env: env.best_action(), task)))

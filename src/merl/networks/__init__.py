@@ -1,1 +1,1 @@
-"""The pieces of a representation and its heads; no piece knows a robot or a learner."""
+"""Encoders, fusion, heads and their parts; none depends on a robot or a learner."""

@@ -1,4 +1,4 @@
-"""Random shift (MERL 4.1, DrQ-v2), and how stacked frames become the network's input."""
+"""Random shift (MERL 4.1, DrQ-v2) and the conversion of stacked frames to the network's input."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from torch import Tensor
 
 
 def draw_shifts(batch_size: int, pad: int, generator: torch.Generator) -> Tensor:
-    """Where each crop begins in the padded image: int64 (B, 2), rows and columns in [0, 2 pad]."""
+    """Draw each crop's offset in the padded image: int64 (B, 2), row and column in [0, 2 pad]."""
     return torch.randint(
         0, 2 * pad + 1, (batch_size, 2), generator=generator, device=generator.device
     )
 
 
 def shift(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
-    """Crop each sample from its edge-padded self, all frames of its stack by the same offset.
+    """Pad each image with its edge pixels and crop it; all frames of a stack share one offset.
 
-    DrQ-v2 writes it as a bilinear `grid_sample`, but its grid lands on pixel centres: the result
-    is an integer crop, so it is made here on the bytes.
+    DrQ-v2 uses a bilinear `grid_sample`, but its grid lands on pixel centres, so its result is an
+    integer crop. This function makes that crop directly on the bytes.
 
     Args:
         images: uint8 (B, K, H, W, C).
-        shifts: int64 (B, 2), from `draw_shifts`; (pad, pad) leaves the image as it is.
-        pad: pixels by which each side is padded.
+        shifts: int64 (B, 2), from `draw_shifts`; (pad, pad) leaves the image unchanged.
+        pad: padding of each side, in pixels.
 
     Returns:
         The shifted stacks, in the shape of `images`.
@@ -39,24 +39,26 @@ def shift(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
 
 
 class RandomShift:
-    """`shift` sample by sample, for who copies the frames anyway: see `core.FrameTransform`.
+    """Random shift of one sample at a time, applied while frames are copied.
+
+    It is a `core.FrameTransform`; for the same shifts its result equals that of `shift`.
 
     Args:
         shifts: int64 (B, 2), from `draw_shifts`.
-        pad: pixels by which each side is padded.
+        pad: padding of each side, in pixels.
     """
 
     def __init__(self, shifts: Tensor, pad: int) -> None:
         self._moves = (shifts - pad).tolist()
 
     def __call__(self, sample: int, frames: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
-        """Write frames (K, H, W, C) to `out`, cropped as the sample is to be."""
+        """Write frames (K, H, W, C) to `out`, cropped with the offset of this sample."""
         height, width, channels = frames.shape[1:]
         down, right = self._moves[sample]
-        # What comes to (y, x) was at (y + down, x + right); further than the last edge is as far.
+        # out[y, x] = frames[y + down, x + right]; beyond the image, the nearest edge pixel.
         down = min(max(down, 1 - height), height - 1)
         right = min(max(right, 1 - width), width - 1)
-        # All bytes move alike, in one piece; what comes across an edge is overwritten.
+        # Move all bytes as one block; the code below overwrites bytes that wrapped across an edge.
         ahead = (down * width + right) * channels
         source, target = frames.reshape(-1), out.reshape(-1)
         if ahead >= 0:
@@ -74,7 +76,7 @@ class RandomShift:
 
 
 def _shift_by_index(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
-    """One gather, for devices where a launch per sample would cost more than it moves."""
+    """Shift with one gather, for devices where a kernel launch per sample is too slow."""
     batch, _, height, width, _ = images.shape
     rows = torch.arange(height, device=images.device) + shifts[:, :1] - pad  # (B, H)
     columns = torch.arange(width, device=images.device) + shifts[:, 1:] - pad  # (B, W)
@@ -88,16 +90,16 @@ def _shift_by_index(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
 
 
 def to_input(images: Tensor, dtype: torch.dtype, middle: int = 128) -> Tensor:
-    """Stacked bytes (B, K, H, W, C) to what a convolution reads: (B, K C, H, W), x - middle.
+    """Convert stacked bytes (B, K, H, W, C) to a convolution's input: (B, K C, H, W), x - middle.
 
-    These whole numbers are exact in bf16, which x / 255 - 0.5 is not; the scale is left to the
-    weights (`encoders.ConvEncoder`). The memory is in channels-last order, which convolutions are
-    fastest with.
+    These integers are exact in bf16, unlike x / 255 - 0.5. The weights of the first convolution
+    apply the scale (`encoders.ConvEncoder`). The memory order is channels-last, in which
+    convolutions are fastest.
 
     Args:
         images: uint8.
-        dtype: of the result.
-        middle: what is subtracted.
+        dtype: type of the result.
+        middle: value that is subtracted from each pixel.
     """
     pixels = _centred(images).view(torch.int8).flatten(3).to(dtype)
     if middle != 128:
@@ -106,12 +108,12 @@ def to_input(images: Tensor, dtype: torch.dtype, middle: int = 128) -> Tensor:
 
 
 def _centred(images: Tensor) -> Tensor:
-    """(B, K, H, W, C) to (B, H, W, K, C), a pixel's channels side by side, each byte less 128."""
+    """Permute (B, K, H, W, C) to (B, H, W, K, C) and subtract 128 from each byte (as int8)."""
     if images.device.type != "cpu":
         return _centred_at_once(images)
     batch, stack, height, width, channels = images.shape
     interleaved = images.new_empty((batch, height, width, stack, channels))
-    # A copy per channel runs along whole images; one permuted copy would run along three bytes.
+    # One copy per channel reads whole images; a single permuted copy would read 3 bytes a time.
     for frame in range(stack):
         for channel in range(channels):
             interleaved[..., frame, channel] = images[:, frame, ..., channel]
@@ -119,5 +121,5 @@ def _centred(images: Tensor) -> Tensor:
 
 
 def _centred_at_once(images: Tensor) -> Tensor:
-    """Where a launch costs more than what it moves; the shift leaves them in this order already."""
+    """Do the same in one operation; `_shift_by_index` returns this memory order already."""
     return images.permute(0, 2, 3, 1, 4).contiguous().bitwise_xor(128)

@@ -1,4 +1,4 @@
-"""The twin critic over a latent (MERL C.1): one value after the other, or both at once."""
+"""Twin critic over a latent (MERL C.1), which computes its heads in turn or both at once."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from merl.networks.returns import Returns, Scalar
 
 
 class TwinCritic(nn.Module):
-    """Q_phi1 and Q_phi2, two heads of their own over one latent (clipped double Q, TD3).
+    """Q_phi1 and Q_phi2, two separate heads over one latent (clipped double Q, TD3).
 
     Attributes:
-        at_once: compute both in the same kernels. A GPU is held up by the number of kernels, a CPU
-            by laying the weights beside each other; None: on a GPU.
-        returns: what an output says about the return.
+        at_once: compute both heads in the same kernels; None: on a GPU only. On a GPU the number of
+            kernels limits the speed; on a CPU stacking the weights costs more than it saves.
+        returns: how an output represents the return.
     """
 
     at_once: bool | None = None
@@ -34,7 +34,7 @@ class TwinCritic(nn.Module):
         self.q1, self.q2 = (MLP(latent_dim + action_dim, outputs, size) for _ in range(2))
 
     def forward(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Latent (B, d) and action (B, A) to an output of each head: (B,), or logits (B, bins)."""
+        """Map latent (B, d) and action (B, A) to each head's output: (B,), or logits (B, bins)."""
         both = torch.cat([latent, action], dim=-1)
         at_once = both.is_cuda if self.at_once is None else self.at_once
         if at_once:
@@ -44,21 +44,21 @@ class TwinCritic(nn.Module):
         return q1.squeeze(-1), q2.squeeze(-1)
 
     def values(self, latent: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Latent (B, d) and action (B, A) to the two values, (B,) each."""
+        """Compute the two values, (B,) each, from latent (B, d) and action (B, A)."""
         q1, q2 = self(latent, action)
         return self.returns.value(q1), self.returns.value(q2)
 
 
 def twins(first: MLP, second: MLP, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Two heads of one shape over the same input, each product and each norm for both in one.
+    """Apply two heads of the same shape to one input, with joint products and norms.
 
     Args:
-        first: a head.
-        second: likewise.
+        first: first head.
+        second: second head, of the same shape.
         x: (B, n).
 
     Returns:
-        What each head makes of it, (B, m): apart from rounding, what it gives by itself.
+        The output of each head, (B, m), equal to that of a separate call except for rounding.
     """
     hidden = list(zip(first.hidden, second.hidden, strict=True))
     own = x.dtype
@@ -80,13 +80,13 @@ def twins(first: MLP, second: MLP, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _both(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Two linear layers: (2, B, n) by (2, m, n) to (2, B, m), in the precision of the weights."""
+    """Apply two linear layers, (2, B, n) by (2, m, n) to (2, B, m), in the weights' precision."""
     layers: Tensor = _Linears.apply(x.to(weight.dtype), weight, bias)  # type: ignore[no-untyped-call]
     return layers
 
 
 class _Linears(torch.autograd.Function):
-    """As `baddbmm`, but for gradients that lie as the weights do: they need no copy to be taken."""
+    """`baddbmm` with weight gradients in the memory order of the weights, which saves a copy."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -96,18 +96,18 @@ class _Linears(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (g,), (x, weight) = gradients, ctx.saved_tensors
-        of_x, of_weight, of_bias = ctx.needs_input_grad
+        x_needs, weight_needs, bias_needs = ctx.needs_input_grad
         return (
-            g @ weight if of_x else None,
-            g.mT @ x if of_weight else None,
-            g.sum(dim=1) if of_bias else None,
+            g @ weight if x_needs else None,
+            g.mT @ x if weight_needs else None,
+            g.sum(dim=1) if bias_needs else None,
         )
 
 
 def _side_by_side(
     pairs: Sequence[tuple[nn.Module, nn.Module]], dtype: torch.dtype
 ) -> Iterator[Tensor]:
-    """The parameters of each pair of modules as one tensor (2, ...) each, in that precision."""
+    """Stack the parameters of each pair of modules to tensors (2, ...) of type `dtype`."""
     parameters = [p for side in zip(*pairs, strict=True) for m in side for p in m.parameters()]
     if not parameters:
         return iter(())
@@ -116,7 +116,7 @@ def _side_by_side(
 
 
 class _SideBySide(torch.autograd.Function):
-    """Parameters a1, b1, ..., a2, b2, ... to (a1, a2), (b1, b2), ...: all of them in one kernel."""
+    """Stack of parameters a1, b1, ..., a2, b2, ... to (a1, a2), (b1, b2), ..., in one kernel."""
 
     @staticmethod
     def forward(ctx: Any, dtype: torch.dtype, *parameters: Tensor) -> tuple[Tensor, ...]:

@@ -1,4 +1,4 @@
-"""Encoders: one per modality, updated by the critic's loss alone (MERL 4.1, C.1)."""
+"""Encoders, one per modality, trained by the critic's loss alone (MERL 4.1, C.1)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ConvEncoder(nn.Module):
         image_size: (H, W) of a frame, in pixels.
         channels: channels of each convolution.
         strides: one stride per convolution; the paper's are 2, 1, 1, 1.
-        pixels: the lowest and the highest pixel, which are scaled to -0.5 and 0.5.
+        pixels: lowest and highest pixel value, which are scaled to -0.5 and 0.5.
 
     Attributes:
         features: length of the flat output.
@@ -51,19 +51,19 @@ class ConvEncoder(nn.Module):
                 least = (least - 1) * stride + 3
             raise MerlError(
                 f"an image of {image_size[0]}x{image_size[1]} pixels is too small for strides "
-                f"{tuple(strides)}, which need {least} pixels a side: use a larger one, or smaller "
-                "--agent.conv-strides"
+                f"{tuple(strides)}, which need {least} pixels per side: use a larger image or "
+                "smaller --agent.conv-strides"
             )
         self.features = channels * height * width
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, stacks: Tensor) -> Tensor:
-        """Stacked frames, uint8 (B, K, H, W, C), to features (B, F): rows, columns, channels."""
+        """Encode stacked frames, uint8 (B, K, H, W, C), to (B, F): rows, columns, channels."""
         first, *others = self.convolutions
         assert isinstance(first, nn.Conv2d)
         assert first.bias is not None
-        # x / 255 - 0.5 = (x - 128) / 255 + 1 / 510, which its weights and bias take in: a few
-        # numbers are multiplied in place of all pixels. Other bounds likewise, about their middle.
+        # x / 255 - 0.5 = (x - 128) / 255 + 1 / 510. The first layer's weights and bias absorb scale
+        # and offset, which is cheaper than scaling all pixels. Other bounds: about their middle.
         span = float(self._high - self._low)
         middle = (self._low + self._high + 1) // 2
         weight, bias = first.weight / span, first.bias
@@ -77,20 +77,20 @@ class ConvEncoder(nn.Module):
 
 
 class Standardize(nn.Module):
-    """A vector with its mean taken off and divided by its standard deviation, number by number.
+    """Standardisation of a vector: each entry minus its mean, divided by its standard deviation.
 
-    Raw, a velocity of 5 rad/s drowns a position of 5 cm. Mean and deviation are those of what
-    `observe` was given until it has seen `STEADY` samples; then they stay. What lies further than
-    `FARTHEST` deviations off is brought there: what rests most of the time, as an object does, is
-    hundreds of them away when it is touched, and would drown everything else (docs/tasks.md).
+    Without it, a velocity of 5 rad/s dominates a position of 5 cm. Mean and deviation are those of
+    the vectors passed to `observe`, and stay fixed after `STEADY` samples. Results are clipped to
+    `FARTHEST` deviations: the entries of an object that rests most of the time are hundreds of
+    deviations off when it is touched, and would dominate everything else (docs/tasks.md).
 
     Args:
         features: length of the vector.
     """
 
     STEADY = 100_000
-    SMALLEST = 0.01  # deviation: what has hardly varied so far may vary later
-    FARTHEST = 5.0  # deviations
+    SMALLEST = 0.01  # lower bound of the deviation: a constant entry may vary later
+    FARTHEST = 5.0  # bound of the result, in deviations
     mean: Tensor
     variance: Tensor
     count: Tensor
@@ -103,28 +103,28 @@ class Standardize(nn.Module):
 
     @torch.no_grad()
     def observe(self, vector: Tensor) -> None:
-        """Take (B, n) into account."""
+        """Update mean and deviation from (B, n), until `STEADY` samples were seen."""
         wanted = self.count < self.STEADY
         self.count += len(vector) * wanted
         share = wanted * len(vector) / self.count
         variance, mean = torch.var_mean(vector, dim=0, correction=0)
-        apart = mean - self.mean
-        self.variance.lerp_(variance, share).add_(share * (1 - share) * apart.square())
-        self.mean.add_(share * apart)
+        change = mean - self.mean
+        self.variance.lerp_(variance, share).add_(share * (1 - share) * change.square())
+        self.mean.add_(share * change)
 
     def forward(self, vector: Tensor) -> Tensor:
-        """(B, n) to (B, n), in [-5, 5]."""
+        """Standardise (B, n) to (B, n), in [-5, 5]."""
         scale = self.variance.clamp(min=self.SMALLEST**2).rsqrt()
         return ((vector - self.mean) * scale).clamp(-self.FARTHEST, self.FARTHEST)
 
 
 class VectorEncoder(nn.Module):
-    """g_zeta: the joints speak for themselves, or a 2-layer MLP with ReLU (MERL C.1, Figure 5).
+    """g_zeta: the identity, or a 2-layer MLP with ReLU (MERL C.1, Figure 5).
 
     Args:
         in_features: length of the vector.
-        width: of the MLP's layers; 0 is the identity, as in the final MERL.
-        standardize: bring the numbers to one scale first.
+        width: width of the MLP's layers; 0 is the identity, as in the final MERL.
+        standardize: standardise the vector first.
 
     Attributes:
         features: length of the encoding.
@@ -143,11 +143,11 @@ class VectorEncoder(nn.Module):
             )
 
     def observe(self, vector: Tensor) -> None:
-        """Take (B, n) into account for the scale."""
+        """Update the standardisation, if there is one, from (B, n)."""
         if self.scale is not None:
             self.scale.observe(vector)
 
     def forward(self, vector: Tensor) -> Tensor:
-        """(B, n) to (B, features)."""
+        """Encode (B, n) to (B, features)."""
         encoded: Tensor = self.layers(vector if self.scale is None else self.scale(vector))
         return encoded

@@ -1,4 +1,4 @@
-"""Multimodal fusion: what each sense encodes becomes one latent of dimension d (MERL 4.1, C.1)."""
+"""Multimodal fusion of the encodings into one latent of dimension d (MERL 4.1, C.1)."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ SIMNORM_GROUP = 8  # features that share one softmax, as in SimNorm (TD-MPC2)
 
 
 class Fusion(nn.Module):
-    """h_psi: per modality Linear, LayerNorm and tanh, concatenated.
+    """h_psi: Linear, LayerNorm and tanh for each modality, concatenated.
 
     Args:
         features: the length of each modality's encoding, by key, in the order of concatenation.
-        share: what each modality has of the whole, numbers; with simnorm a multiple of eight.
-        layer_norm: whether to normalise (the paper's Figure 3c switches it off).
+        share: length of each modality's part of the latent; with simnorm a multiple of eight.
+        layer_norm: whether to normalise (Figure 3c of the paper tests without).
         squash: "tanh", or "simnorm" for a softmax over groups of eight.
 
     Attributes:
-        latent_dim: d, the length of the whole.
-        modalities: the keys.
+        latent_dim: d, the length of the latent.
+        modalities: the keys, in the order of concatenation.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Fusion(nn.Module):
         )
 
     def forward(self, encoded: Mapping[str, Tensor]) -> Tensor:
-        """Encodings {key: (B, F_key)} to the latent (B, d), each entry in (-1, 1)."""
+        """Fuse encodings {key: (B, F_key)} to the latent (B, d), each entry in (-1, 1)."""
         latents = []
         layers = zip(self.modalities, self.projections.values(), self.norms.values(), strict=True)
         for key, projection, norm in layers:
@@ -66,14 +66,14 @@ class Fusion(nn.Module):
 
 
 class Concatenation(nn.Module):
-    """No fusion: the encodings side by side, as state-based agents take them.
+    """Concatenation of the encodings without fusion, for state-based agents.
 
     Args:
         features: the length of each modality's encoding, by key, in the order of concatenation.
 
     Attributes:
         latent_dim: the sum of the lengths.
-        modalities: the keys.
+        modalities: the keys, in the order of concatenation.
     """
 
     def __init__(self, features: Mapping[str, int]) -> None:
@@ -82,5 +82,5 @@ class Concatenation(nn.Module):
         self.modalities = tuple(features)
 
     def forward(self, encoded: Mapping[str, Tensor]) -> Tensor:
-        """Encodings {key: (B, F_key)} to (B, sum of F_key)."""
+        """Concatenate encodings {key: (B, F_key)} to (B, sum of F_key)."""
         return torch.cat([encoded[key] for key in self.modalities], dim=-1)

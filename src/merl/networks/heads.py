@@ -1,4 +1,4 @@
-"""Heads: MLPs over a latent, and the actors that are made of one (MERL C.1)."""
+"""MLP heads over a latent, and the actors built from them (MERL C.1)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Norm = Literal["layer", "none"]
 
 
 class Hidden(nn.Module):
-    """Linear, a norm (or none) and ReLU; the norm in the precision of the weights."""
+    """Linear layer, optional norm and ReLU; the norm runs in the precision of the weights."""
 
     def __init__(self, in_features: int, width: int, norm: Norm) -> None:
         super().__init__()
@@ -23,27 +23,27 @@ class Hidden(nn.Module):
             self.norm = nn.LayerNorm(width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, in_features) to (B, width)."""
+        """Map (B, in_features) to (B, width)."""
         return torch.relu(self.norm(self.linear(x).to(self.linear.weight.dtype)))
 
 
 class Output(nn.Linear):
-    """The last linear layer, always in the precision of the weights: bf16 would round Q away."""
+    """Last linear layer, always in the precision of the weights: bf16 rounds Q too coarsely."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, in_features) to (B, out_features)."""
+        """Map (B, in_features) to (B, out_features)."""
         with torch.autocast(x.device.type, enabled=False):
             return super().forward(x.to(self.weight.dtype))
 
 
 @dataclass(frozen=True)
 class HeadSize:
-    """The shape of actor and critic.
+    """Shape of an actor or critic head.
 
     Attributes:
-        layers: linear layers, the output layer counted.
-        width: of each hidden layer.
-        norm: before each ReLU: LayerNorm or none.
+        layers: number of linear layers, including the output layer.
+        width: width of each hidden layer.
+        norm: normalisation before each ReLU: LayerNorm or none.
     """
 
     layers: int
@@ -52,7 +52,7 @@ class HeadSize:
 
 
 class MLP(nn.Sequential):
-    """Layers of that shape; ReLU after each but the last."""
+    """MLP of the given shape, with ReLU after each layer but the last."""
 
     def __init__(self, in_features: int, out_features: int, size: HeadSize) -> None:
         widths = [in_features] + [size.width] * (size.layers - 1)
@@ -73,7 +73,7 @@ class MLP(nn.Sequential):
 
 
 class Actor(nn.Module):
-    """pi_theta: the latent to the mean action."""
+    """pi_theta: network from the latent to the mean action."""
 
     def __init__(self, latent_dim: int, action_dim: int, size: HeadSize) -> None:
         super().__init__()
@@ -81,15 +81,14 @@ class Actor(nn.Module):
         self.layers = MLP(latent_dim, action_dim, size)
 
     def forward(self, latent: Tensor) -> Tensor:
-        """(B, d) to (B, A), in (-1, 1)."""
+        """Compute the mean action (B, A), in (-1, 1), from the latent (B, d)."""
         return torch.tanh(self.layers(latent))
 
 
 class GaussianActor(nn.Module):
-    """pi_theta of SAC: the latent to the mean and the spread of a Gaussian, before its tanh.
+    """pi_theta of SAC: network from the latent to mean and log std of a Gaussian, before its tanh.
 
-    log sigma is brought into [-10, 2] by a tanh of its own, so that its gradient never ends at a
-    bound.
+    Another tanh maps log sigma to [-10, 2], so that no bound cuts off its gradient.
     """
 
     LEAST, GREATEST = -10.0, 2.0
@@ -100,7 +99,7 @@ class GaussianActor(nn.Module):
         self.layers = MLP(latent_dim, 2 * action_dim, size)
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, d) to mu and log sigma, (B, A) each."""
+        """Compute mu and log sigma, (B, A) each, from the latent (B, d)."""
         mean, raw = self.layers(latent).chunk(2, dim=-1)
         log_std = self.LEAST + (self.GREATEST - self.LEAST) * (torch.tanh(raw) + 1) / 2
         return mean, log_std

@@ -1,4 +1,4 @@
-"""Orthogonal initialisation, biases at zero (MERL C.1; gains as in DrQ-v2)."""
+"""Orthogonal initialisation with zero biases (MERL C.1; gains as in DrQ-v2)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def orthogonal(module: nn.Module) -> None:
     for layer in module.modules():
         if isinstance(layer, nn.Linear | nn.Conv2d):
             gain = math.sqrt(2.0) if isinstance(layer, nn.Conv2d) else 1.0
-            # By way of a contiguous tensor: convolutions keep theirs in channels-last order.
+            # Draw into a contiguous tensor: a convolution's weights are in channels-last order.
             layer.weight.copy_(nn.init.orthogonal_(torch.empty(layer.weight.shape), gain))
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)

@@ -1,4 +1,4 @@
-"""The name of a modality's module."""
+"""Module names of modalities."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from torch import nn
 
 
 def module_name(key: str) -> str:
-    """The key itself, unless torch would take it for something else (`arm.joints`, `type`)."""
+    """Return the key, or an encoded form where torch rejects it (`arm.joints`, `type`)."""
     if key.isidentifier() and not hasattr(nn.ModuleDict(), key):
         return key
     return f"key_{key.encode().hex()}"

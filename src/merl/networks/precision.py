@@ -1,4 +1,4 @@
-"""What a layer computes in."""
+"""Precision that a layer computes in."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def compute_dtype(weight: Tensor) -> torch.dtype:
-    """Of a layer with this weight: autocast's precision where that is on, else the weight's."""
+    """Return the precision of autocast if it is enabled, else that of the layer's weight."""
     device = weight.device.type
     enabled = torch.is_autocast_enabled(device)
     return torch.get_autocast_dtype(device) if enabled else weight.dtype

@@ -1,4 +1,4 @@
-"""What an agent senses: an encoder per modality, shared by actor and critic."""
+"""Encoders of an agent's observation, one per modality, shared by actor and critic."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from merl.networks.names import module_name
 
 
 class Encoders(nn.Module):
-    """f_xi and g_zeta: an encoder per modality, over images that are shifted when learning.
+    """f_xi and g_zeta: an encoder per modality; updates shift the images first.
 
     Args:
         images: encoder of each image key.
         vectors: encoder of each vector key.
-        pad: the random shift, in pixels to each side; 0 is none.
+        pad: random shift, in pixels to each side; 0 disables it.
 
     Attributes:
-        image_keys: what is seen.
-        vector_keys: what is felt.
+        image_keys: keys of the images.
+        vector_keys: keys of the vectors.
         features: the length of each modality's encoding, images first.
     """
 
@@ -37,7 +37,7 @@ class Encoders(nn.Module):
         self.features |= {key: encoder.features for key, encoder in vectors.items()}
 
     def observe(self, observation: Mapping[str, Tensor]) -> None:
-        """Take a batch's vectors into account for their scale, where one is kept."""
+        """Update the standardisation of the vector encoders that have one from a batch."""
         for key, encoder in zip(self.vector_keys, self.vectors.values(), strict=True):
             assert isinstance(encoder, VectorEncoder)
             encoder.observe(observation[key])
@@ -48,9 +48,9 @@ class Encoders(nn.Module):
         """Encode each modality.
 
         Args:
-            observation: images uint8 (B, K, H, W, C), vectors float (B, n); a key that is not there
-                is not encoded.
-            shifts: per image key the crop of each sample, int64 (B, 2); None leaves images alone.
+            observation: images uint8 (B, K, H, W, C), vectors float (B, n); missing keys are not
+                encoded.
+            shifts: crop offset of each sample by image key, int64 (B, 2); None shifts no image.
 
         Returns:
             {key: (B, F_key)}, images first.

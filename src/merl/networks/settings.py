@@ -1,4 +1,4 @@
-"""The settings of torch that merl's networks need, whatever the program around them has set."""
+"""Torch settings that merl's networks need, independent of the surrounding program."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ def torch_settings(device: torch.device, threads: int | None = None) -> Iterator
     """Run torch with the settings that merl needs, and restore the caller's afterwards.
 
     An environment or a program that uses merl may change torch's global settings at any time. Here
-    new tensors are float32 and lie where the code says, gradients are recorded, no autocast is
-    active, and no operation is refused for being nondeterministic. With nothing to change this
-    takes 5 us.
+    new tensors are float32 and on the device that the code names, gradients are recorded, autocast
+    is off, and nondeterministic operations are allowed. If nothing has to change, this takes 5 us.
 
     Args:
-        device: where the networks live.
-        threads: processor threads of an operation; None leaves them as they are.
+        device: device of the networks.
+        threads: CPU threads of an operation; None keeps torch's setting.
     """
     with ExitStack() as stack:
         dtype, before = torch.get_default_dtype(), torch.get_num_threads()

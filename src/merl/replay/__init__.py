@@ -1,4 +1,4 @@
-"""A ring of single frames; stacks of frames and n-step returns are made when sampled."""
+"""Replay of single frames; sampling makes the frame stacks and the n-step returns."""
 
 from merl.replay.buffer import ReplayBuffer
 from merl.replay.config import ReplayConfig, check_fits, replay_bytes

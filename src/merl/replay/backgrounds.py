@@ -1,4 +1,4 @@
-"""What a camera that stands still sees behind everything that moves."""
+"""Backgrounds: estimates of the static part of a fixed camera's images."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from numpy.typing import NDArray
 from merl.core import MerlError
 
 STAGES = (1, 5, 25)
-"""A background is made after so many episodes' first pictures."""
+"""Numbers of episodes after whose first images a new background is made."""
 
 
 class Backgrounds:
-    """Medians of some episodes' first pictures: the arm, each time elsewhere, vanishes in them.
+    """Medians, pixel by pixel, of the first images of several episodes.
 
-    What is on the disk is those first pictures, so that a run that goes back to a checkpoint makes
-    the same backgrounds from there on as it would have made.
+    Each episode starts with the arm in another place, so the median removes the arm. The disk holds
+    the first images, so that a run that is resumed from a checkpoint makes the same backgrounds as
+    it would have made without the interruption.
 
     Args:
-        size: bytes of a picture.
-        file: keeps the first pictures, one behind the other; without one they are in memory alone.
+        size: bytes of an image.
+        file: file of the first images, one after the other; None keeps them in memory only.
 
     Attributes:
-        starts: how many first pictures there are.
+        starts: number of first images.
     """
 
     def __init__(self, size: int, file: Path | None) -> None:
@@ -33,21 +34,21 @@ class Backgrounds:
         self._in_memory = np.empty((0, size), np.uint8)
         self.starts = min(len(self._first()), STAGES[-1])
         self._made = self._medians()
-        # A run that was begun when the backgrounds themselves were kept stays with those.
+        # Older runs stored the backgrounds themselves, and continue to use those.
         former = _whole(file and file.with_suffix(".background"), size)
         self._final = bool(len(former))
         self._made.extend(former)
 
     def __len__(self) -> int:
-        """How many there are; number 0, of no picture at all, is black."""
+        """Return the number of backgrounds; number 0, made from no image, is black."""
         return len(self._made)
 
     def __getitem__(self, number: int) -> NDArray[np.uint8]:
-        """One of them: (size,)."""
+        """Return a background, uint8 (size,)."""
         return self._made[number]
 
     def begun(self, picture: NDArray[np.uint8]) -> None:
-        """An episode begins so: after some of them the background is known better."""
+        """Add the first image of an episode; at some counts, make a better background."""
         if self._final or self.starts == STAGES[-1]:
             return
         row = picture.reshape(1, -1)
@@ -56,24 +57,24 @@ class Backgrounds:
         else:
             try:
                 _append(self._file, row, self.starts * self._size)
-            except OSError:  # a full disk: the next episode will do
+            except OSError:  # the disk is full: try again in the next episode
                 return
         self.starts += 1
         if self.starts in STAGES:
             self._made.append(self._median(self.starts))
 
     def go_back(self, starts: int) -> None:
-        """Forget the first pictures after the first so many, and what was made of them.
+        """Keep the first `starts` images and their backgrounds, and discard all newer ones.
 
         Raises:
-            MerlError: there are not so many, so that what was kept could not be told any more.
+            MerlError: there are fewer images, so that images of the replay cannot be decoded.
         """
         if self._final:
             return
         if starts > self.starts:
             raise MerlError(
-                f"{self._file} holds {self.starts} of the {starts} pictures that the replay's are "
-                "kept as differences from: bring the whole folder back, or start a new run"
+                f"{self._file} holds {self.starts} of the {starts} images that decode the replay's "
+                "images: restore the complete run folder, or start a new run"
             )
         self.starts = starts
         self._made = self._medians()
@@ -82,7 +83,7 @@ class Backgrounds:
             os.truncate(self._file, starts * self._size)
 
     def _first(self) -> NDArray[np.uint8]:
-        """The first pictures (n, size): read when they are wanted, which is seldom."""
+        """Return the first images (n, size), read from the file at each of the few calls."""
         return self._in_memory if self._file is None else _whole(self._file, self._size)
 
     def _medians(self) -> list[NDArray[np.uint8]]:
@@ -95,7 +96,7 @@ class Backgrounds:
 
 
 def _whole(file: Path | None, size: int) -> NDArray[np.uint8]:
-    """The pictures (n, size) that a file holds; one that was cut short is none."""
+    """Return the images (n, size) in a file, without an incomplete last one."""
     if file is None or not file.exists():
         return np.empty((0, size), np.uint8)
     raw = np.fromfile(file, np.uint8)
@@ -103,9 +104,9 @@ def _whole(file: Path | None, size: int) -> NDArray[np.uint8]:
 
 
 def _append(path: Path, picture: NDArray[np.uint8], at: int) -> None:
-    """Have it on the disk before any picture is kept as a difference from what is made of it."""
+    """Write an image to the disk, before any image depends on the background made from it."""
     with path.open("ab") as file:
-        file.truncate(at)  # one that was cut short
+        file.truncate(at)  # remove an incomplete image
         file.write(picture.tobytes())
         file.flush()
         os.fsync(file.fileno())

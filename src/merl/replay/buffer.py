@@ -1,4 +1,4 @@
-"""Several environments fill the replay at once: a ring for each, sampled as one."""
+"""Replay of several environments: one ring for each, sampled as one."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from merl.replay.ring import EpisodeRing
 
 
 class ReplayBuffer:
-    """A ring for each environment, so that episodes that grow side by side stay in one piece.
+    """One ring for each environment, so that each episode is contiguous in its ring.
 
-    Every step that any of them holds is sampled with the same probability.
+    Every step in any of the rings is sampled with the same probability.
 
     Args:
-        config: what is kept and how it is sampled.
+        config: contents of the replay and how it is sampled.
         observation_space: see `EpisodeRing`.
         action_space: see `EpisodeRing`.
-        count: of environments.
-        directory: where the rings lie; one alone lies there itself, several in folders 0, 1, ...
-        capacity: steps that are kept in all, in place of the config's.
+        count: number of environments.
+        directory: folder of a single ring; several rings are in its folders 0, 1, ...
+        capacity: maximum number of steps in all rings together, instead of the config's.
 
     Attributes:
-        rings: the rings, in the environments' order.
+        rings: the rings, in the order of the environments.
 
     Raises:
         MerlError: see `EpisodeRing`.
@@ -67,7 +67,7 @@ class ReplayBuffer:
         ]
 
     def __len__(self) -> int:
-        """Steps that can be sampled now."""
+        """Return the number of steps that can be sampled."""
         return sum(len(ring) for ring in self.rings)
 
     def sample(
@@ -77,7 +77,7 @@ class ReplayBuffer:
         now: FrameTransforms | None = None,
         then: FrameTransforms | None = None,
     ) -> Batch:
-        """Draw steps uniformly, with replacement; those of one ring lie side by side.
+        """Draw steps uniformly with replacement; samples of one ring are adjacent.
 
         Arguments, batch and errors are those of `EpisodeRing.sample`.
         """
@@ -97,39 +97,39 @@ class ReplayBuffer:
         )
 
     def flush(self) -> None:
-        """Have everything written reach the disk; returns when it has."""
+        """Write all data to the disk, and return when it is there."""
         for ring in self.rings:
             ring.flush()
 
     def settle(self) -> None:
-        """A checkpoint of the present state is on the disk: no older one is to be gone back to."""
+        """Confirm that a checkpoint of this state is on disk: older states are not needed."""
         for ring in self.rings:
             ring.settle()
 
     def state_dict(self) -> dict[str, Any]:
-        """As `EpisodeRing.state_dict`; with several rings, the states of all."""
+        """Return `EpisodeRing.state_dict()`; with several rings, the states of all."""
         states: list[dict[str, Any]] = [ring.state_dict() for ring in self.rings]
         if len(states) == 1:
             return states[0]
         return {"rings": states, "open": any(state["open"] for state in states)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go back to what `state_dict` said; see `EpisodeRing.load_state_dict`.
+        """Restore from `state_dict()`; see `EpisodeRing.load_state_dict`.
 
         Raises:
-            MerlError: a ring does not hold what the state names.
+            MerlError: a ring does not hold the timestep of its state.
         """
-        for ring, its in zip(self.rings, state.get("rings", [state]), strict=True):
-            ring.load_state_dict(its)
+        for ring, ring_state in zip(self.rings, state.get("rings", [state]), strict=True):
+            ring.load_state_dict(ring_state)
 
 
-def _from(first: int, copies: FrameTransforms | None) -> FrameTransforms | None:
-    """The copies for a part of the batch that begins with sample `first`."""
+def _from(first: int, transforms: FrameTransforms | None) -> FrameTransforms | None:
+    """Return the frame transforms for the part of the batch that starts at sample `first`."""
 
-    def of_part(copy: FrameTransform) -> FrameTransform:
-        return lambda sample, frames, out: copy(first + sample, frames, out)
+    def shifted(transform: FrameTransform) -> FrameTransform:
+        return lambda sample, frames, out: transform(first + sample, frames, out)
 
-    return copies and {key: of_part(copy) for key, copy in copies.items()}
+    return transforms and {key: shifted(transform) for key, transform in transforms.items()}
 
 
 def _joined(batches: list[Batch]) -> Batch:

@@ -1,4 +1,4 @@
-"""What the replay keeps, and whether there is room for it."""
+"""Config of the replay, its size in bytes, and checks of free disk space and memory."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from merl.replay.compression import SLOTS_OF_ANY_PICTURE
 from merl.replay.storage import fields_of
 
 MOST_N_STEP, MOST_FRAME_STACK = 1000, 100
-"""What is still sampled in reasonable time and memory."""
+"""Upper bounds for sampling in reasonable time and memory."""
 
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """What the replay keeps and how it is sampled."""
+    """Contents of the replay and how it is sampled."""
 
     capacity: int = 1_000_000
-    """Steps that are kept; a run that is shorter reserves only its own length."""
+    """Maximum number of steps in the replay; a shorter run reserves only its own length."""
     batch_size: int = 256
-    """Samples in one update."""
+    """Samples per update."""
     n_step: int = 3
-    """Rewards that are summed before the critic's estimate takes over."""
+    """Number of rewards that are summed before the critic's estimate (n-step return)."""
     frame_stack: int = 3
-    """Pictures in a row that make one observation."""
+    """Number of consecutive images in one observation."""
     discount: float = 0.99
-    """What a reward is worth one step later (gamma), from 0 to 1."""
+    """Discount factor per step (gamma), from 0 to 1."""
     compress: bool = False
-    """Keep pictures compressed, without loss, in a quarter of the space; sampling takes longer.
-    Pictures of a real camera, which have noise, need more: then fewer steps are kept."""
+    """Compress images without loss to about a quarter of the space; sampling takes longer. Noisy
+    images of a real camera need more space, so that the replay holds fewer steps."""
 
     def __post_init__(self) -> None:
         for name in ("capacity", "batch_size", "n_step", "frame_stack"):
@@ -51,8 +51,9 @@ class ReplayConfig:
             raise MerlError(f"replay.discount is {self.discount}: give a number from 0 to 1")
         if self.batch_size > self.capacity:
             raise MerlError(
-                f"replay.batch-size {self.batch_size} is larger than the replay of "
-                f"{counted(self.capacity, 'step')}: give at most {self.capacity}, or more steps"
+                f"replay.batch-size {self.batch_size} is larger than a replay of "
+                f"{counted(self.capacity, 'step')}: give at most {self.capacity}, or raise "
+                "replay.capacity"
             )
 
 
@@ -63,14 +64,14 @@ def replay_bytes(
     capacity: int | None = None,
     rings: int = 1,
 ) -> int:
-    """Bytes that a replay takes, on disk or in memory.
+    """Return the bytes that a replay takes, on disk or in memory.
 
     Args:
-        config: what is kept.
+        config: contents of the replay.
         observation_space: see `EpisodeRing`.
         action_space: see `EpisodeRing`.
-        capacity: steps, in place of the config's.
-        rings: rings that share them.
+        capacity: maximum number of steps, instead of the config's.
+        rings: number of rings that share these steps.
     """
     steps = config.capacity if capacity is None else capacity
     fields = fields_of(observation_space, action_space, config.compress)
@@ -87,20 +88,20 @@ def check_fits(
     capacity: int | None = None,
     rings: int = 1,
 ) -> None:
-    """Refuse a replay that the disk or the memory cannot hold, before anything is created.
+    """Reject a replay that does not fit on the disk or in memory, before anything is created.
 
-    Even a replay on disk has to fit into memory: one that does not reads the disk for every sample.
+    A replay on disk must fit into memory too: otherwise every sample reads from the disk.
 
     Args:
-        config: what is kept.
+        config: contents of the replay.
         observation_space: see `EpisodeRing`.
         action_space: see `EpisodeRing`.
-        directory: where it is to lie, or lies already; in memory, if not given.
-        capacity: steps, in place of the config's.
-        rings: rings that share them.
+        directory: folder of the replay, new or existing; None: in memory.
+        capacity: maximum number of steps, instead of the config's.
+        rings: number of rings that share these steps.
 
     Raises:
-        MerlError: it does not fit: the message names the largest capacity that would.
+        MerlError: it does not fit; the message names the largest capacity that fits.
     """
     steps = config.capacity if capacity is None else capacity
 
@@ -110,29 +111,29 @@ def check_fits(
     room = {"of memory are available": available_memory()}
     if directory is not None:
         where = existing_parent(directory)
-        # Those that are there, if it is opened again.
+        # An existing replay reuses the bytes of its own files.
         ours = sum(file.stat().st_size for file in directory.rglob("*.bin"))
-        room[f"of disk are free in {where}"] = free_disk(where) + ours
+        room[f"of disk space are free in {where}"] = free_disk(where) + ours
     what, least = min(room.items(), key=lambda item: item[1])
     if bytes_of(config, steps) > least:
         raise _too_large(config, steps, bytes_of, what, least)
 
 
 def ring_capacity(steps: int, rings: int) -> int:
-    """Steps of one of so many rings that share them."""
+    """Return the steps of each ring if `rings` rings share `steps`."""
     return math.ceil(steps / rings)
 
 
 def slots_for(config: ReplayConfig, capacity: int) -> int:
-    """Timesteps that hold `capacity` steps of episodes of two hundred steps or more.
+    """Return the number of slots that hold `capacity` steps of episodes of at least 200 steps.
 
-    An episode has one timestep more than steps, and the oldest step needs its whole stack. Episodes
-    that are shorter fill the slots before the capacity is reached. There is always room for one
-    step and the beginning of the next episode, even of pictures that no compression makes smaller.
+    An episode has one timestep more than steps, and the oldest step needs its whole stack. Shorter
+    episodes fill the slots before the capacity is reached. There is always room for one step and
+    the start of the next episode, even with incompressible images.
     """
     least = config.frame_stack + 2
     if config.compress:
-        least = SLOTS_OF_ANY_PICTURE * (least + 1)  # none reaches across the end of the bytes
+        least = SLOTS_OF_ANY_PICTURE * (least + 1)  # no image crosses the end of the bytes
     return max(capacity + capacity // 200 + config.frame_stack, least)
 
 
@@ -143,16 +144,16 @@ def _too_large(
     what: str,
     room: int,
 ) -> MerlError:
-    """The error that names the largest capacity for which there is room."""
+    """Return the error, which names the largest capacity that fits."""
     need = bytes_of(config, capacity)
     low, high = 0, capacity  # low fits, high does not
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if bytes_of(config, middle) <= room else (low, middle)
-    way_out = f"--replay.capacity {low} would fit" if low else "free some"
+    way_out = f"--replay.capacity {low} would fit" if low else "free some of it"
     small = bytes_of(replace(config, compress=True), capacity)
     if small < need and small <= room:
-        way_out = f"--replay.compress brings it to {small / 1e9:.3g} GB, or {way_out}"
+        way_out = f"--replay.compress reduces it to {small / 1e9:.3g} GB, or {way_out}"
     return MerlError(
         f"a replay of {counted(capacity, 'step')} needs {need / 1e9:.3g} GB, but "
         f"{room / 1e9:.3g} GB {what}: {way_out}"

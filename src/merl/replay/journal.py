@@ -1,9 +1,9 @@
-"""What a ring overwrote since the last checkpoint, so that a run can go back to it exactly.
+"""Journal of the timesteps that a ring overwrote since the last checkpoint, for exact resuming.
 
-A ring that has wrapped overwrites its oldest timesteps, which the last checkpoint still refers to.
-Each of these is appended to `overwritten.journal` before: the number of the timestep that takes its
-place, the fields of its slot, and its compressed pictures. A checkpoint that is on the disk empties
-the file.
+A ring that has wrapped overwrites its oldest timesteps, although the last checkpoint refers to
+them. Before that, each is appended to `overwritten.journal`: the number of the timestep that
+replaces it, the fields of its slot, and its compressed images. Once a new checkpoint is on disk,
+the file is emptied.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ _LOG = logging.getLogger(__name__)
 
 
 class Journal:
-    """The overwritten timesteps, in the order in which they were.
+    """Overwritten timesteps, in the order in which they were overwritten.
 
     Args:
-        directory: the ring's.
+        directory: folder of the ring.
         data: the ring's arrays, (slots, *shape) each.
-        places: where in them entry number timestep - 1 lies.
-        pictures: its compressed pictures, by the name of their field.
+        ring_index: map from entry number timestep - 1 to its slot.
+        pictures: the ring's compressed images, by field.
 
     Raises:
-        MerlError: the file cannot be made.
+        MerlError: the file cannot be created.
     """
 
     def __init__(
@@ -45,23 +45,23 @@ class Journal:
         ring_index: RingIndex,
         pictures: Mapping[str, CompressedPictures],
     ) -> None:
-        self._data, self._places, self._pictures = data, ring_index, pictures
+        self._data, self._ring_index, self._pictures = data, ring_index, pictures
         fields = [("by", "<i8"), *((name, a.dtype, a.shape[1:]) for name, a in data.items())]
-        self._row = np.zeros(1, np.dtype(fields))  # without padding: bytes as they lie in the file
-        self._kept = True
+        self._row = np.zeros(1, np.dtype(fields))  # without padding, as in the file
+        self._is_complete = True
         try:
-            # Unbuffered: what was written survives the process.
+            # Unbuffered: written data survives if the process is killed.
             self._file = (directory / _FILE).open("a+b", buffering=0)
         except OSError as error:
-            raise MerlError(f"cannot keep a replay in {directory}: {error.strerror}") from None
+            raise MerlError(f"cannot store a replay in {directory}: {error.strerror}") from None
 
     def keep(self, slot: int, by: int) -> None:
-        """Remember what a slot has, which timestep number `by` is about to overwrite.
+        """Record the contents of a slot, before timestep number `by` overwrites it.
 
-        Where that cannot be written (a full disk), it is told once, and what is overwritten until
-        the next checkpoint would be missing if the run went back to the last one.
+        If the file cannot be written (the disk is full), the journal warns once and records nothing
+        until the next checkpoint: resuming from the last one loses the overwritten timesteps.
         """
-        if not self._kept:
+        if not self._is_complete:
             return
         row = self._row[0]
         row["by"] = by
@@ -76,20 +76,22 @@ class Journal:
             whole, reason = False, error.strerror or str(error)
         if not whole:
             self._file.truncate(end)
-            self._kept = False
+            self._is_complete = False
             _LOG.warning(
-                "what the replay overwrites is not kept until the next checkpoint (%s)", reason
+                "cannot write the replay's journal: %s; until the next checkpoint, resuming loses "
+                "the oldest steps of the replay",
+                reason,
             )
 
     def holds(self, timestep: int) -> bool:
-        """Whether a timestep of that number was overwritten, and can be put back."""
+        """Return whether a timestep was overwritten and can be restored."""
         return any(row["timestep"] == timestep for row, _ in self._records())
 
     def undo(self, timesteps: int) -> None:
-        """Put back what timesteps after number `timesteps` have overwritten, the newest first."""
+        """Restore what the timesteps after number `timesteps` have overwritten, newest first."""
         for row, pictures in reversed(list(self._records())):
             if row["by"] > timesteps:
-                slot = self._places.of(int(row["timestep"]) - 1)
+                slot = self._ring_index.of(int(row["timestep"]) - 1)
                 for name, array in self._data.items():
                     array[slot] = row[name]
                 for name, kept in pictures.items():
@@ -97,12 +99,12 @@ class Journal:
         self.empty()
 
     def empty(self) -> None:
-        """Forget all: the ring is as the last checkpoint has it."""
+        """Remove all records: the ring is in the state of the last checkpoint."""
         self._file.truncate(0)
-        self._kept = True
+        self._is_complete = True
 
     def _records(self) -> Iterator[tuple[Any, dict[str, bytes]]]:
-        """All that is kept; one that was cut short, by a process that died, is none."""
+        """Yield all records, except one that is incomplete because the process died."""
         self._file.seek(0)
         raw = self._file.read()
         at, size = 0, self._row.nbytes

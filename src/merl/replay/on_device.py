@@ -1,8 +1,8 @@
-"""A copy of the rings on the device that learns, from which batches are drawn there.
+"""A copy of the rings on the learner's device, from which batches are drawn there.
 
-The rings on the host stay what a run goes on from. What they take in is brought over when it is
-asked for, a slot or two a step; sampling reads the copy alone, and asks nothing of the host, so
-that it can be part of a CUDA graph.
+A run is resumed from the rings on the host, not from the copy. `follow` copies new entries, one or
+two slots per step. Sampling reads only the copy and never waits for the host, so that it can be
+part of a CUDA graph.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from merl.replay.ring import EpisodeRing
 from merl.replay.sampling import Sampler
 
 CHUNK = 4096
-"""Slots that are brought over at once, at most."""
+"""Maximum number of slots that are copied at once."""
 
 
 def bytes_on_device(rings: Sequence[EpisodeRing]) -> int:
-    """What the copy takes."""
+    """Return the bytes that the copy takes."""
     return sum(array.nbytes for ring in rings for array in ring.arrays().values())
 
 
 class OnDevice:
-    """Rings of the same environment, one behind the other, on a device.
+    """Copy, on a device, of rings with the same spaces, one after the other.
 
     Args:
-        rings: on the host; without compression.
-        device: where the copy lies.
+        rings: rings on the host, without compression.
+        device: device of the copy.
     """
 
     def __init__(self, rings: Sequence[EpisodeRing], device: torch.device) -> None:
@@ -52,14 +52,14 @@ class OnDevice:
         }
         self._sources = torch.zeros(len(rings) * self._capacity, dtype=torch.int64, device=device)
         # For each ring: its first step that can be sampled, its steps so far, and its newest
-        # timestep, counted from the one in its first slot.
+        # timestep, numbered such that number 1 is in its first slot.
         self._counts = torch.zeros((len(rings), 3), dtype=torch.int64, device=device)
-        self._told = torch.zeros_like(self._counts, device="cpu")
-        self._there = [(0, 0)] * len(rings)  # timesteps and steps that were brought over
+        self._host_counts = torch.zeros_like(self._counts, device="cpu")
+        self._copied = [(0, 0)] * len(rings)  # timesteps and steps that were copied
         self._sampler = Sampler(self._fields, first.config)
 
     def follow(self) -> None:
-        """Bring over what the rings have taken in since the last time."""
+        """Copy what was added to the rings since the last call."""
         counts = torch.tensor(
             [
                 (*counts, timesteps - ring.ring_index.origin)
@@ -67,30 +67,30 @@ class OnDevice:
                 for *counts, timesteps in [ring.counts()]
             ]
         )
-        if torch.equal(counts, self._told):
+        if torch.equal(counts, self._host_counts):
             return
-        self._told = counts
+        self._host_counts = counts
         for index, (ring, (_, steps, timesteps)) in enumerate(
             zip(self._rings, counts.tolist(), strict=True)
         ):
-            had_timesteps, had_steps = self._there[index]
+            had_timesteps, had_steps = self._copied[index]
             arrays = {name: torch.from_numpy(array) for name, array in ring.arrays().items()}
             for part in _parts(had_timesteps, timesteps, ring.ring_index.length):
                 at = self._first_slots[index] + part.start
                 for name, array in arrays.items():
-                    self._bring(array[part], self._fields[name], at)
+                    self._copy(array[part], self._fields[name], at)
             for part in _parts(had_steps, steps, self._capacity):
                 sources = torch.from_numpy(ring.sources[part] - ring.ring_index.origin)
-                self._bring(sources, self._sources, index * self._capacity + part.start)
-            self._there[index] = (timesteps, steps)
-        self._bring(counts, self._counts, 0)
+                self._copy(sources, self._sources, index * self._capacity + part.start)
+            self._copied[index] = (timesteps, steps)
+        self._copy(counts, self._counts, 0)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
-        """Draw steps uniformly, with replacement, from what `follow` brought over.
+        """Draw steps uniformly, with replacement, from what `follow` has copied.
 
         Args:
-            batch_size: how many; at least one step must be held.
-            generator: on the device.
+            batch_size: B; the copy must hold at least one step.
+            generator: random generator on the device.
 
         Returns:
             Tensors on the device; shapes as in `merl.core.Batch`.
@@ -105,7 +105,7 @@ class OnDevice:
         return self.at(ring, steps[ring] - through[ring] + drawn)
 
     def at(self, ring: Tensor, step: Tensor) -> Batch:
-        """The samples that start at these steps of these rings, each int64 (B,)."""
+        """Return the samples that start at steps `step` of rings `ring`, each int64 (B,)."""
         source = self._sources[ring * self._capacity + step % self._capacity]
         newest = self._counts[ring, 2]
         indices = self._sampler.pick(source, newest, self._bases[ring], self._slots[ring])
@@ -115,15 +115,15 @@ class OnDevice:
         )
         return Batch(now, self._sampler.action(indices), indices.reward, indices.discount, then)
 
-    def _bring(self, part: Tensor, whole: Tensor, at: int) -> None:
-        """Copy rows over. From pinned memory the host does not wait for the card."""
+    def _copy(self, part: Tensor, whole: Tensor, at: int) -> None:
+        """Copy rows to the device; from pinned memory, so that the host does not wait."""
         if self._device.type == "cuda":
             part = part.pin_memory()
         whole[at : at + len(part)].copy_(part, non_blocking=True)
 
 
 def _parts(had: int, has: int, length: int) -> Iterator[slice]:
-    """Where in a ring the entries number `had` to `has` - 1 lie, in pieces; the last `length`."""
+    """Yield the ring's slices with entries `had` to `has` - 1, at most the last `length`."""
     begin = max(had, has - length)
     marks = {begin, has, *range(begin, has, CHUNK)}
     marks |= set(range(-(-begin // length) * length, has, length))

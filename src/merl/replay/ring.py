@@ -1,17 +1,17 @@
-"""The ring: slots, timesteps and steps; stacks and n-step returns are made when sampled.
+"""Ring of slots, timesteps and steps; sampling makes the frame stacks and the n-step returns.
 
 One slot holds one *timestep*: an observation, and the action, reward and discount that led to it.
-An episode of T steps takes T + 1 timesteps in a row; no action led to the first of them. Timesteps
+An episode of T steps takes T + 1 consecutive timesteps; the first of them has no action. Timesteps
 are numbered 1, 2, 3, ...; timestep i is entry i - 1 of the slots (`ring_index.py`).
 
     timestep        7      8      9     10     11     12
-    position      0      1      2      3      0      1      in its episode; 0 begins one
-    step              *      *      *             *         o_t -> o_{t+1}, what is sampled
+    position      0      1      2      3      0      1      in its episode; 0 is the first
+    step              *      *      *             *         o_t -> o_{t+1}, the unit of sampling
 
-A process that is killed loses nothing that was written. A machine that loses power loses what came
-after the last `flush`, and where that had begun to overwrite old timesteps, those may be torn. A
-checkpoint calls `flush`, keeps `state_dict`, and calls `settle` once it is on the disk: what is
-overwritten from then on goes into a journal, from which `load_state_dict` puts it back.
+If the process is killed, no written data is lost. If the machine loses power, data since the last
+`flush` is lost, and old timesteps that this data had begun to overwrite may be corrupt. To save a
+checkpoint, call `flush`, store `state_dict`, and call `settle` once the checkpoint is on disk. From
+then on, overwritten timesteps go into a journal, from which `load_state_dict` restores them.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ _LOG = logging.getLogger(__name__)
 
 
 class EpisodeRing:
-    """The steps that were taken, and batches of them for the learner.
+    """Ring of environment steps, from which batches are sampled.
 
-    Every step that is held is sampled with the same probability, those of the episode in progress
-    included. Nothing reaches across an episode's boundary: at the start the stack repeats the first
-    frame, at the end the return is shorter. An episode that was begun while the former had not
-    ended cuts that one off; it bootstraps, as at a time limit.
+    Every step in the ring is sampled with the same probability, including the steps of the episode
+    in progress. Stacks and returns do not cross episode boundaries: at the start the stack repeats
+    the first frame, at the end the return is shorter. A new episode truncates one that has not
+    ended; the truncated one bootstraps, as at a time limit.
 
     Attributes:
-        config: what is kept and how it is sampled.
-        capacity: steps that are kept.
-        places: where the timesteps lie; a timestep's entry is its number less one.
-        keys: the field that each of an observation's keys is kept in.
-        sources: step i led away from timestep sources[i mod capacity].
+        config: contents of the ring and how it is sampled.
+        capacity: maximum number of steps.
+        ring_index: map from timesteps to slots; a timestep's entry is its number minus one.
+        keys: the field of each observation key.
+        sources: step i starts at timestep sources[i mod capacity].
     """
 
     def __init__(
@@ -70,20 +70,19 @@ class EpisodeRing:
         directory: Path | None = None,
         capacity: int | None = None,
     ) -> None:
-        """Create the ring, or open the one that `directory` holds with all that was written to it.
+        """Create the ring, or open the existing ring in `directory` with all its data.
 
         Args:
-            config: what is kept and how it is sampled.
-            observation_space: the keys that are kept: images (uint8, H x W x C) and vectors
-                (float, n).
+            config: contents of the ring and how it is sampled.
+            observation_space: the keys to store: images (uint8, H x W x C) and vectors (float, n).
             action_space: a vector.
-            directory: where the ring lies, memory-mapped; without one it lies in memory.
-            capacity: steps that are kept, in place of the config's. A ring that is opened again
-                grows to it.
+            directory: folder of the memory-mapped ring; None: the ring is in memory.
+            capacity: maximum number of steps, instead of the config's. An existing ring grows to
+                it.
 
         Raises:
-            MerlError: a space that cannot be kept, a capacity that does not fit, a directory that
-                holds another replay or cannot be written. Nothing is left behind.
+            MerlError: a space cannot be stored, the capacity does not fit, or the directory holds
+                another replay or cannot be written. No new file remains.
         """
         self.config = config
         self.capacity = config.capacity if capacity is None else capacity
@@ -118,7 +117,7 @@ class EpisodeRing:
             if span_name(key) in fields
         }
         self._data = arrays  # a row for each slot
-        self._values = {**fields_of(observation_space, action_space)}  # what is written
+        self._values = {**fields_of(observation_space, action_space)}  # fields of written values
         self._ahead = ReadAhead()
         self._images: dict[str, Pictures] = {
             name: self._compressed[name] if name in self._compressed else RawPictures(arrays[name])
@@ -129,23 +128,23 @@ class EpisodeRing:
         if directory is not None:
             self._journal = Journal(directory, self._data, layout.slots, self._compressed)
         self.ring_index = layout.slots
-        fields_there = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        self._sampler = Sampler(fields_there, config)
-        self._timesteps = self._steps = 0  # ever written
+        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        self._sampler = Sampler(tensors, config)
+        self._timesteps = self._steps = 0  # numbers ever written
         self._first = 0  # the oldest step that can be sampled
-        self._oldest = 1  # the oldest timestep that is held
+        self._oldest = 1  # the oldest timestep in the ring
         self._open = False  # an episode is in progress
         self._settled = 0  # the newest timestep of the last checkpoint
-        self._told = False  # that fewer steps are held than asked for
+        self._warned = False  # that the ring holds fewer steps than its capacity
         self.sources = np.zeros(self.capacity, np.int64)
-        self._take_over(timesteps=int(self._data["timestep"].max()))
+        self._rebuild(timesteps=int(self._data["timestep"].max()))
 
     def __len__(self) -> int:
-        """Steps that can be sampled now."""
+        """Return the number of steps that can be sampled."""
         return self._steps - self._first
 
     def begin(self, observation: Observation) -> None:
-        """The first timestep of an episode; one still in progress is cut off.
+        """Write the first timestep of an episode; truncate one that is still in progress.
 
         Raises:
             MerlError: the observation does not fit the space.
@@ -157,18 +156,18 @@ class EpisodeRing:
         self._open = True
 
     def add(self, transition: Transition) -> None:
-        """One step of the episode in progress.
+        """Write one step of the episode in progress.
 
         Raises:
-            MerlError: action or observation do not fit the space.
+            MerlError: the action or the observation does not fit its space.
             ValueError: no episode is in progress, or the discount contradicts `last`.
         """
         if not self._open:
             raise ValueError("no episode is in progress: call begin() with its first observation")
         if transition.discount != 1.0 and not (transition.discount == 0.0 and transition.last):
             raise ValueError(
-                f"discount {transition.discount} with last={transition.last}: it is 0 at a true "
-                "end, which is last, and 1 everywhere else"
+                f"discount {transition.discount} with last={transition.last} is invalid: use 0 "
+                "with last=True at a true end, and 1 everywhere else"
             )
         source = self._timesteps
         self._write(
@@ -190,21 +189,21 @@ class EpisodeRing:
         now: FrameTransforms | None = None,
         then: FrameTransforms | None = None,
     ) -> Batch:
-        """Draw steps uniformly, with replacement.
+        """Draw steps uniformly with replacement.
 
         The same content and the same state of `rng` give the same batch.
 
         Args:
             batch_size: B.
-            rng: draws.
-            now: how the frames of o_t are copied out, where not as they are.
-            then: likewise of o_{t+n}.
+            rng: random generator.
+            now: frame transforms of o_t by image key; frames of other keys are copied unchanged.
+            then: frame transforms of o_{t+n}.
 
         Returns:
-            Tensors on the CPU that are the caller's own; shapes as in `merl.core.Batch`.
+            Tensors on the CPU, owned by the caller; shapes as in `merl.core.Batch`.
 
         Raises:
-            ValueError: no step is held yet.
+            ValueError: the ring holds no step.
         """
         if not len(self):
             raise ValueError("the replay is empty: add a step before sampling")
@@ -230,30 +229,30 @@ class EpisodeRing:
 
     @property
     def compressed(self) -> bool:
-        """Whether pictures are kept compressed."""
+        """Whether images are stored compressed."""
         return bool(self._compressed)
 
     def arrays(self) -> Mapping[str, NDArray[Any]]:
-        """The ring's arrays by field, (slots, ...), to be read; of compressed pictures none."""
+        """Return the arrays by field, (slots, ...), to read only; without compressed images."""
         return self._data
 
     def counts(self) -> tuple[int, int, int]:
-        """The first step that can be sampled, how many steps there were, the newest timestep."""
+        """Return the first step that can be sampled, the steps so far, and the newest timestep."""
         return self._first, self._steps, self._timesteps
 
     def flush(self) -> None:
-        """Have everything written reach the disk; returns when it has."""
+        """Write all data to the disk, and return when it is there."""
         for file in self._files.values():
             file.flush()
 
     def settle(self) -> None:
-        """A checkpoint of the present state is on the disk: no older one is to be gone back to."""
+        """Confirm that a checkpoint of this state is on disk: older states are not needed."""
         self._settled = self._timesteps
         if self._journal is not None:
             self._journal.empty()
 
     def state_dict(self) -> dict[str, Any]:
-        """The cursor and its counts as plain numbers; the timesteps stay where they are."""
+        """Return the counts that locate the data, as plain numbers; the data stays in the ring."""
         return {
             "timesteps": self._timesteps,
             "steps": self._steps,
@@ -262,44 +261,44 @@ class EpisodeRing:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go back to what `state_dict` said; what was written since then is forgotten.
+        """Restore from `state_dict()`, and discard everything written since then.
 
-        What was overwritten since then is put back, if that was the last state to be settled. If
-        the timestep of the state itself is overwritten and cannot be put back (the disk was full,
-        or the state is an older one), the ring stays as it is, with a warning: the steps that it
-        holds are of the same run.
+        Timesteps that were overwritten since then are restored, if the state is the last one that
+        was settled. If the state's own timestep is overwritten and cannot be restored (the disk was
+        full, or the state is older), the ring stays unchanged, with a warning: its steps are from
+        the same run.
 
         Raises:
-            MerlError: the ring does not hold what the state names, and nothing newer.
+            MerlError: the ring holds neither the state's timestep nor a newer one.
         """
         timesteps = int(state["timesteps"])
         journal = self._journal
-        there = timesteps == 0 or self._data["timestep"][self._slot(timesteps)] == timesteps
-        if not there and (journal is None or not journal.holds(timesteps)):
+        is_held = timesteps == 0 or self._data["timestep"][self._slot(timesteps)] == timesteps
+        if not is_held and (journal is None or not journal.holds(timesteps)):
             if self._timesteps > timesteps:
                 _LOG.warning(
-                    "the replay has overwritten what it held at the checkpoint, and keeps the %s "
-                    "newer steps that it has: training continues, but not bit for bit as before",
+                    "the replay has overwritten timesteps of the checkpoint and keeps its %s newer "
+                    "steps: training continues, but not bit-exactly",
                     f"{len(self):,}",
                 )
                 if journal is not None:
                     journal.empty()
-                self._take_over(self._timesteps)
+                self._rebuild(self._timesteps)
                 self._settled = 0
                 return
             raise MerlError(
-                f"the replay does not hold timestep {timesteps:,}, at which the checkpoint was "
-                "taken: it belongs to another run; start a new run"
+                f"the replay does not hold timestep {timesteps:,} of the checkpoint: the replay "
+                "belongs to another run; restore the complete run folder, or start a new run"
             )
         for name, starts in state.get("starts", {}).items():
             self._compressed[name].backgrounds.go_back(int(starts))
         if journal is not None:
             journal.undo(timesteps)
-        self._take_over(timesteps, int(state["steps"]), bool(state["open"]))
+        self._rebuild(timesteps, int(state["steps"]), bool(state["open"]))
         self._settled = timesteps
 
     def _slot(self, timestep: int) -> int:
-        """Where the ring holds a timestep."""
+        """Return the slot of a timestep."""
         return self.ring_index.of(timestep - 1)
 
     def _write(
@@ -311,7 +310,7 @@ class EpisodeRing:
         reward: float,
         discount: float,
     ) -> None:
-        """Write the next timestep; all is checked before anything is changed."""
+        """Write the next timestep; check all values before any change."""
         data = self._data
         values = {name: observation.get(key) for key, name in self.keys.items()}
         values["action"] = np.zeros_like(data["action"][0]) if action is None else action
@@ -320,11 +319,11 @@ class EpisodeRing:
             check_value(name, value, field.dtype, field.shape)
         timestep = self._timesteps + 1
         slot = self._slot(timestep)
-        kept = {n: p.encode(np.asarray(values.pop(n))) for n, p in self._compressed.items()}
-        self._make_room(timestep, kept)
+        encoded = {n: p.encode(np.asarray(values.pop(n))) for n, p in self._compressed.items()}
+        self._make_room(timestep, encoded)
         for name, value in values.items():
             data[name][slot] = value
-        for name, picture in kept.items():
+        for name, picture in encoded.items():
             self._compressed[name].write(slot, picture)
         data["position"][slot] = position
         data["reward"][slot] = reward
@@ -333,34 +332,34 @@ class EpisodeRing:
         self._timesteps = timestep
         self._forget()
 
-    def _make_room(self, timestep: int, kept: Mapping[str, bytes]) -> None:
-        """Let go of the oldest timesteps, as many as timestep number `timestep` will overwrite."""
-        ends = {name: self._compressed[name].end_of(picture) for name, picture in kept.items()}
+    def _make_room(self, timestep: int, encoded: Mapping[str, bytes]) -> None:
+        """Release the oldest timesteps, which timestep number `timestep` will overwrite."""
+        ends = {name: self._compressed[name].end_of(picture) for name, picture in encoded.items()}
         while self._oldest < timestep:
             slot = self._slot(self._oldest)
             if self._oldest > timestep - self.ring_index.length:
                 if not any(self._compressed[n].overwritten(slot, end) for n, end in ends.items()):
                     break
-                self._tell_of_less()
+                self._warn_of_fewer_steps()
             if self._journal is not None and self._oldest <= self._settled:
                 self._journal.keep(slot, by=timestep)
-            # From here on it is no timestep, should the process die while it is overwritten.
+            # Mark the slot as empty, in case the process dies while overwriting it.
             self._data["timestep"][slot] = 0
             self._oldest += 1
 
-    def _tell_of_less(self) -> None:
-        """Pictures fill their bytes before the capacity is reached."""
-        if not self._told:
-            self._told = True
+    def _warn_of_fewer_steps(self) -> None:
+        """Warn, once, that images fill the reserved bytes before the capacity is reached."""
+        if not self._warned:
+            self._warned = True
             _LOG.warning(
-                "pictures take more bytes than --replay.compress reserves: the replay keeps about "
-                "%s of its %s steps; a run with --replay.no-compress keeps all",
+                "images take more bytes than --replay.compress reserves: the replay keeps about "
+                "%s of its %s steps; to keep all, start a run with --replay.no-compress",
                 f"{len(self):,}",
                 f"{self.capacity:,}",
             )
 
     def _forget(self) -> None:
-        """Let go of the oldest steps: beyond the capacity, or with a frame that is overwritten."""
+        """Release the oldest steps: those beyond the capacity or with an overwritten frame."""
         while self._first < self._steps:
             source = int(self.sources[self._first % self.capacity])
             position = int(self._data["position"][self._slot(source)])
@@ -369,21 +368,19 @@ class EpisodeRing:
                 break
             self._first += 1
 
-    def _take_over(
-        self, timesteps: int, steps: int | None = None, in_progress: bool = False
-    ) -> None:
-        """Go on after timestep number `timesteps`: find the steps that the ring holds up to there.
+    def _rebuild(self, timesteps: int, steps: int | None = None, in_progress: bool = False) -> None:
+        """Set the ring to timestep number `timesteps`, and find the steps that it holds up to it.
 
         Args:
-            timesteps: timesteps ever written.
-            steps: steps ever taken; unknown, they are counted from the oldest that is held.
-            in_progress: the episode that the last timestep belongs to goes on.
+            timesteps: number of timesteps ever written.
+            steps: number of steps ever written; None: number of steps in the ring.
+            in_progress: whether the episode of the last timestep continues.
         """
         stamps = self._data["timestep"]
-        stamps[stamps > timesteps] = 0  # else they would pass for what follows, if opened once more
+        stamps[stamps > timesteps] = 0  # else a later opening would find them as newer timesteps
         numbers = np.arange(max(0, timesteps - self.ring_index.length) + 1, timesteps + 1)
         slots = self.ring_index.of(numbers - 1)
-        missing = numbers[stamps[slots] != numbers]  # overwritten since, or only half written
+        missing = numbers[stamps[slots] != numbers]  # overwritten, or only half written
         self._oldest = int(missing[-1] if missing.size else timesteps - len(numbers)) + 1
         for pictures in self._compressed.values():
             pictures.go_on_after(self._slot(timesteps) if timesteps else None)
@@ -396,18 +393,18 @@ class EpisodeRing:
         self._forget()
 
     def _read_ahead(self, indices: SampleIndices) -> None:
-        """Ask for the pictures of a batch: a sample's lie in one piece but for where the ring ends.
+        """Request the images of a batch; those of a sample are contiguous except at the ring's end.
 
-        They are on the disk alone after a resumption, and wherever others use the memory.
+        Images are only on disk after a run was resumed, or if other programs use the memory.
         """
         now, then = indices.now.numpy(), indices.then.numpy()
-        near = self.config.n_step <= self.config.frame_stack  # o_t and o_{t+n} touch
+        near = self.config.n_step <= self.config.frame_stack  # stacks of o_t and o_{t+n} touch
         for first, last in [(now, then)] if near else [(now, now), (then, then)]:
             for name, pictures in self._images.items():
                 self._ahead.ask(self._files[name], *pictures.stretch(first[:, 0], last[:, -1]))
 
     def _observation(self, slots: torch.Tensor, copies: FrameTransforms) -> dict[str, torch.Tensor]:
-        """Images (B, K, H, W, C) at slots (B, K), vectors (B, n) at the newest of them."""
+        """Return images (B, K, H, W, C) at slots (B, K), and vectors (B, n) at the newest slots."""
         return {
             key: torch.from_numpy(
                 copied(self._images[name], slots.numpy(), copies.get(key, as_it_is))

@@ -1,4 +1,4 @@
-"""Where in a ring its entries lie, and how one that has come round is made longer."""
+"""Positions of entries in a ring, and how a ring that has wrapped grows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Number = TypeVar("Number", int, NDArray[np.int64])
 
 
 class Move(NamedTuple):
-    """Entries that are to lie elsewhere: so many from a place on, to another."""
+    """Move of a number of entries from position `begin` to position `to`."""
 
     begin: int
     entries: int
@@ -21,36 +21,36 @@ class Move(NamedTuple):
 
 @dataclass(frozen=True)
 class RingIndex:
-    """Entries are numbered as they come, 0, 1, 2, ...; number i lies at (i - origin) mod length.
+    """Map from entries, numbered 0, 1, 2, ..., to positions: (number - origin) mod length.
 
     Attributes:
-        length: entries that the ring has room for.
-        origin: the entry that lies in the first place, or would.
+        length: number of entries for which the ring has room.
+        origin: the number, possibly negative, that maps to position 0.
     """
 
     length: int
     origin: int = 0
 
     def of(self, number: Number) -> Number:
-        """Where an entry lies."""
+        """Return the position of an entry."""
         return (number - self.origin) % self.length
 
     def least_longer(self, end: int) -> int:
-        """The least length that `longer` can make of it."""
-        return self.length + (min(self._parts(end)) if self._has_come_round(end) else 0)
+        """Return the smallest length that `longer` supports."""
+        return self.length + (min(self._parts(end)) if self._has_wrapped(end) else 0)
 
     def longer(self, length: int, end: int) -> tuple[RingIndex, Move | None]:
-        """The places of a longer ring, and what has to be moved within it for that.
+        """Return the index of a longer ring, and the move within the ring that it requires.
 
-        Where the ring has come round, its oldest entries lie behind its newest: one of the two is
-        brought to the new end. Nothing is moved to where anything lies, so that the ring is as it
-        was until its places are replaced.
+        In a ring that has wrapped, the oldest entries are behind the newest: one of the two parts
+        moves to the new end. The move overwrites no entry, so the ring is valid with the old index
+        until the new index replaces it.
 
         Args:
-            length: at least `least_longer(end)`.
-            end: the number of the next entry.
+            length: new length, at least `least_longer(end)`.
+            end: number of the next entry.
         """
-        if not self._has_come_round(end):
+        if not self._has_wrapped(end):
             return RingIndex(length, self.origin), None
         newer, older = self._parts(end)
         if newer <= older:
@@ -58,10 +58,10 @@ class RingIndex:
             return RingIndex(length, end - self.length - newer), move if newer else None
         return RingIndex(length, end - newer - length), Move(newer, older, to=length - older)
 
-    def _has_come_round(self, end: int) -> bool:
+    def _has_wrapped(self, end: int) -> bool:
         return end - self.origin > self.length
 
     def _parts(self, end: int) -> tuple[int, int]:
-        """How many entries lie before the place of the next one, and how many from there on."""
+        """Return the number of positions before that of the next entry, and from there on."""
         newer = self.of(end)
         return newer, self.length - newer

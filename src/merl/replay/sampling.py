@@ -1,7 +1,7 @@
-"""What a sampled step is made of: its stack, its n-step return, and what it led to.
+"""Sampling of steps: frame stack, n-step return and next observation.
 
-The same arithmetic on the arrays of the ring, wherever they lie: in memory, on the disk, or on a
-GPU, where nothing of it asks the card for an answer.
+The same arithmetic works on the arrays of the ring in memory, on disk and on a GPU, where it never
+waits for a result.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from merl.replay.config import ReplayConfig
 
 @dataclass(frozen=True)
 class SampleIndices:
-    """Where B sampled steps lie in the ring, and what they paid.
+    """Slots of B sampled steps in the ring, with their returns.
 
     Attributes:
-        now: slots of o_t's frames, oldest first, int64 (B, K).
-        then: slots of o_{t+m}'s, likewise.
+        now: slots of the frames of o_t, oldest first, int64 (B, K).
+        then: slots of the frames of o_{t+m}, oldest first, int64 (B, K).
         action: slot of the timestep that a_t led to, int64 (B,).
         reward: sum of gamma^i r_{t+i} for i < m, float32 (B,).
         discount: gamma^m, or 0 at a true end, float32 (B,).
@@ -35,11 +35,11 @@ class SampleIndices:
 
 
 class Sampler:
-    """Finds what belongs to a step, in one ring or in several that lie behind one another.
+    """Computation of samples, from one ring or from several rings one after the other.
 
     Args:
-        fields: the arrays by name, of several rings one behind the other; see `storage.fields_of`.
-        config: stack, n and discount.
+        fields: the arrays by name, with all rings one after the other; see `storage.fields_of`.
+        config: frame stack, n and discount.
     """
 
     def __init__(self, fields: Mapping[str, Tensor], config: ReplayConfig) -> None:
@@ -51,13 +51,13 @@ class Sampler:
         self._powers = torch.tensor(powers, dtype=torch.float64, device=device)
 
     def pick(self, source: Tensor, newest: Tensor, base: Tensor, slots: Tensor) -> SampleIndices:
-        """Lay out the samples that start at timesteps `source`.
+        """Return slots and returns of the samples that start at timesteps `source`.
 
         Args:
-            source: numbers of timesteps, int64 (B,), where number 1 lies in the first slot.
-            newest: the newest timestep of their ring, int64 (B,) or (1,).
-            base: the first slot of their ring, likewise.
-            slots: of their ring, likewise.
+            source: numbers of timesteps, int64 (B,); number 1 is in the first slot of its ring.
+            newest: newest timestep of each sample's ring, int64 (B,) or (1,).
+            base: first slot of each sample's ring, int64 (B,) or (1,).
+            slots: number of slots of each sample's ring, int64 (B,) or (1,).
         """
         fields, newest, timesteps = self._fields, newest[:, None], source[:, None]
         base, length = base[:, None], slots[:, None]
@@ -65,13 +65,13 @@ class Sampler:
         def slot(timestep: Tensor) -> Tensor:
             return (timestep - 1) % length + base
 
-        begun = timesteps - fields["position"][slot(timesteps)]  # the episode's first
-        ahead = timesteps + 1 + self._ahead  # (B, n): what r_t, r_{t+1}, ... led to
+        begun = timesteps - fields["position"][slot(timesteps)]  # first timestep of the episode
+        ahead = timesteps + 1 + self._ahead  # (B, n): timesteps of r_t, r_{t+1}, ...
         led_to = slot(ahead)
         same = ((ahead <= newest) & (fields["position"][led_to] > 0)).long().cumprod(dim=1)
         steps = same.sum(dim=1)  # (B,): m
         end = timesteps + steps[:, None]
-        # Slots beyond the newest timestep may never have been written: no number times 0 is none.
+        # Slots beyond the newest timestep may hold NaN, and NaN times 0 is NaN.
         paid = torch.where(same.bool(), fields["reward"][led_to], 0.0)
         rewards = paid * self._powers[:-1]  # float64
         last = fields["discount"][slot(end)[:, 0]]
@@ -84,14 +84,14 @@ class Sampler:
         )
 
     def observed(self, name: str, slots: Tensor) -> Tensor:
-        """What was seen at slots (B, K): (B, K, H, W, C); of vectors the newest, (B, n)."""
+        """Return the images at slots (B, K), (B, K, H, W, C), or the newest vectors, (B, n)."""
         field = self._fields[name]
         if field.dtype != torch.uint8:
             return field.index_select(0, slots[:, -1])
-        if field.device.type == "cpu":  # where NumPy takes half the time (docs/bench.md)
+        if field.device.type == "cpu":  # there, NumPy takes half the time (docs/bench.md)
             return torch.from_numpy(field.numpy().take(slots.numpy(), axis=0))
         return field.index_select(0, slots.flatten()).view(*slots.shape, *field.shape[1:])
 
     def action(self, indices: SampleIndices) -> Tensor:
-        """a_t, float32 (B, A)."""
+        """Return a_t, float32 (B, A)."""
         return self._fields["action"].index_select(0, indices.action)

@@ -1,10 +1,11 @@
-"""How the ring lies on the disk: a file per field, memory-mapped, its space reserved before use.
+"""Storage of the ring on disk: one memory-mapped file per field, with space reserved before use.
 
 `<field>.bin` is the raw little-endian array (slots, *shape) in C order. `replay.json` lists fields,
-types, shapes and the number of slots; it is written last, so a directory that has it is whole. An
-observation's key is quoted as in a URL: `observation.image.bin`, `observation.arm%2Fjoints.bin`.
-Compressed pictures lie behind one another in theirs, `observation.image.span.bin` says where
-(`compression.py`). Which slot, or which byte, the ring begins with is an origin (`ring_index.py`).
+types, shapes and the number of slots; it is written last, so a directory that has it is complete.
+Observation keys are quoted as in a URL: `observation.image.bin`, `observation.arm%2Fjoints.bin`.
+The file of compressed images holds one after the other; `observation.image.span.bin` holds their
+positions (`compression.py`). An origin gives the slot and the byte at which the ring starts
+(`ring_index.py`).
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ class Field:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything lies.
+    """Positions of all entries.
 
     Attributes:
-        slots: of the ring; a timestep's entry is its number less one.
-        bytes: of compressed pictures, by field.
+        slots: index of the slots; a timestep's entry is its number minus one.
+        bytes: index of the bytes of compressed images, by field.
     """
 
     slots: RingIndex
@@ -65,7 +66,7 @@ class Layout:
         origin: int = 0,
         byte_origins: Mapping[str, int] | None = None,
     ) -> Layout:
-        """That of so many slots."""
+        """Make the layout for this number of slots."""
         origins = byte_origins or {}
         compressed = [name for name in fields if f"{name}.span" in fields]
         return cls(
@@ -82,7 +83,11 @@ def fields_of(
     action_space: gymnasium.spaces.Box,
     compress: bool = False,
 ) -> dict[str, Field]:
-    """The arrays of the ring, by name; of compressed pictures their bytes and their spans."""
+    """Return the fields of the ring by name; for compressed images, their bytes and spans.
+
+    Raises:
+        MerlError: a space is neither an image nor a vector.
+    """
     fields: dict[str, Field] = {}
     for key, space in observation_space.spaces.items():
         shape = space.shape or ()
@@ -96,51 +101,51 @@ def fields_of(
             dtype = np.dtype("<f4")
         else:
             raise MerlError(
-                f"observation {key!r} is {space}: replay keeps images, Box(H, W, C) of uint8, and "
-                "vectors, Box(n) of floats; wrap the environment or leave the key out"
+                f"observation {key!r} is {space}: replay stores images, Box(H, W, C) of uint8, and "
+                "vectors, Box(n) of floats; convert the key in a wrapper, or remove it"
             )
         fields[field_name(key)] = Field(dtype, shape)
     if len(action_space.shape) != 1 or not math.prod(action_space.shape):
-        raise MerlError(f"the action space is {action_space}: replay keeps vectors, Box(n)")
+        raise MerlError(f"the action space is {action_space}: use a vector, Box(n)")
     fields["action"] = Field(np.dtype("<f4"), action_space.shape)
     fields["reward"] = Field(np.dtype("<f4"), ())
     fields["discount"] = Field(np.dtype("<f4"), ())
     fields["position"] = Field(np.dtype("<i4"), ())
-    fields["timestep"] = Field(np.dtype("<i8"), ())  # its number; 0 while there is none
+    fields["timestep"] = Field(np.dtype("<i8"), ())  # its number; 0: an empty slot
     return fields
 
 
 def field_name(key: str) -> str:
-    """The field of an observation's key; also a file name, so a slash is quoted."""
+    """Return the field of an observation key; also a file name, so a slash is quoted."""
     return f"observation.{quote(key, safe='')}"
 
 
 def span_name(key: str) -> str:
-    """The field that says where a key's compressed pictures lie."""
+    """Return the field with the positions of a key's compressed images."""
     return f"{field_name(key)}.span"
 
 
 def check_value(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-    """Raise MerlError unless the value can be kept as it is in so many numbers of this type."""
+    """Raise MerlError if the value has another kind of type or another shape than its field."""
     if value is None:
-        raise MerlError(f"{name} is missing, although the observation space has it")
+        raise MerlError(f"{name} is missing: return it with each observation, as its space says")
     value = np.asarray(value)
     kind_fits = value.dtype.kind == dtype.kind and (dtype != np.uint8 or value.dtype == np.uint8)
     if value.shape != shape or not kind_fits:
         raise MerlError(
             f"{name} is {value.dtype} {value.shape}, but its space says "
-            f"{dtype} {shape}: mend what the environment or the agent returns"
+            f"{dtype} {shape}: correct the output of the environment or the agent"
         )
 
 
 def open_files(
     directory: Path, fields: dict[str, Field], slots: int, capacity: int
 ) -> tuple[dict[str, mmap.mmap], Layout]:
-    """Create the files, or lengthen those that are there where they are too short, and map them.
+    """Create the files, or lengthen existing files that are too short, and map them.
 
     Raises:
-        MerlError: the disk is full, the directory cannot be written, or it holds something else.
-            What was created is removed again, what was there is as it was.
+        MerlError: the disk is full, the directory cannot be written, or it holds another replay or
+            a damaged one. New files are removed, existing files keep their contents.
     """
     header = directory / _HEADER
     before = _read_layout(header, fields)
@@ -155,7 +160,7 @@ def open_files(
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for name, path in paths.items():
-            if not held:  # there without a header: left by a process that died while reserving
+            if not held:  # no header: left by a process that died while reserving
                 path.unlink(missing_ok=True)
             reserve_file(path, sizes[name])
         files = {name: _map(path, sizes[name]) for name, path in paths.items()}
@@ -169,7 +174,7 @@ def open_files(
             _undo(lengths, new_folders)
         if isinstance(error, OSError):
             why = error.strerror or error
-            raise MerlError(f"cannot keep a replay in {directory}: {why}") from error
+            raise MerlError(f"cannot store a replay in {directory}: {why}") from error
         raise
     return files, layout
 
@@ -177,15 +182,15 @@ def open_files(
 def _lengthened(
     directory: Path, fields: Mapping[str, Field], layout: Layout, slots: int
 ) -> tuple[Layout, dict[str, Move]]:
-    """A ring's layout with so many slots, or a few more if need be, and what to move for it.
+    """Return a layout of `slots` slots, or a few more if necessary, and the moves it requires.
 
-    Moves are in bytes, by field. A ring that has enough slots stays as it is.
+    Moves are in bytes, by field. A ring that has enough slots stays unchanged.
     """
     held = layout.slots.length
     if slots <= held:
         return layout, {}
     timesteps = int(np.fromfile(directory / "timestep.bin", "<i8", held).max(initial=0))
-    ends = {}  # of the compressed pictures
+    ends = {}  # position after the newest compressed image
     for name in layout.bytes:
         spans = np.fromfile(directory / f"{name}.span.bin", "<i8", 2 * held).reshape(-1, 2)
         ends[name] = int(spans[layout.slots.of(timesteps - 1)].sum()) if timesteps else 0
@@ -194,20 +199,20 @@ def _lengthened(
         least.append(-(-ring_index.least_longer(ends[name]) // fields[name].bytes))
     slots = max(slots, *least)
     ring_index, move = layout.slots.longer(slots, timesteps)
-    moves, of_bytes = {}, {}
+    moves, byte_indices = {}, {}
     for name, field in fields.items():
         if name not in layout.bytes:
             if move is not None:
                 moves[name] = Move(*(field.bytes * part for part in move))
             continue
-        of_bytes[name], its = layout.bytes[name].longer(slots * field.bytes, ends[name])
-        if its is not None:
-            moves[name] = its
-    return Layout(ring_index, of_bytes), moves
+        byte_indices[name], byte_move = layout.bytes[name].longer(slots * field.bytes, ends[name])
+        if byte_move is not None:
+            moves[name] = byte_move
+    return Layout(ring_index, byte_indices), moves
 
 
 def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:
-    """Give files the lengths that they had, remove those that had none, and the new folders."""
+    """Restore the former lengths of files; remove new files and new folders."""
     for path, length in lengths.items():
         if not length:
             path.unlink(missing_ok=True)
@@ -218,10 +223,10 @@ def _undo(lengths: Mapping[Path, int], new_folders: Iterable[Path]) -> None:
 
 
 def _read_layout(header: Path, fields: dict[str, Field]) -> Layout | None:
-    """That of the ring that lies there; None if there is none.
+    """Return the layout of the existing ring, or None if there is none.
 
     Raises:
-        MerlError: it cannot be gone on with.
+        MerlError: the existing ring has other fields or is damaged, so that it cannot be used.
     """
     if not header.exists():
         return None
@@ -249,13 +254,13 @@ def _read_layout(header: Path, fields: dict[str, Field]) -> Layout | None:
         AttributeError,
         RecursionError,
     ) as error:
-        raise MerlError(f"{directory} holds a damaged replay: give another folder") from error
+        raise MerlError(f"{directory} holds a damaged replay: use another folder") from error
     if not same:
         raise MerlError(
-            f"{directory} holds a replay of other observations or actions: give another folder"
+            f"{directory} holds a replay of other observations or actions: use another folder"
         )
     if not whole or held < 1:
-        raise MerlError(f"{directory} holds a truncated replay: give another folder")
+        raise MerlError(f"{directory} holds a truncated replay: use another folder")
     return layout
 
 
@@ -272,7 +277,7 @@ def _header_text(fields: dict[str, Field], layout: Layout, capacity: int) -> str
 
 
 def _described(fields: dict[str, Field]) -> dict[str, Any]:
-    """As JSON has it."""
+    """Describe the fields for JSON."""
     return {
         name: {"dtype": field.dtype.str, "shape": list(field.shape)}
         for name, field in fields.items()
@@ -280,7 +285,7 @@ def _described(fields: dict[str, Field]) -> dict[str, Any]:
 
 
 def _write_text(path: Path, text: str) -> None:
-    """Replace the file as a whole, or not at all."""
+    """Replace the file atomically."""
     temporary = path.with_suffix(".tmp")
     try:
         with temporary.open("w") as file:

@@ -1,6 +1,6 @@
-"""What a run has to show: its curves, their uncertainty, and the pictures made of them.
+"""Reports: learning curves of runs, their uncertainty, and figures of them.
 
-Everything here works from a run's folder alone and needs neither torch nor MuJoCo.
+They are made from run folders alone and need neither torch nor MuJoCo.
 """
 
 from merl.core.resources import load_matplotlib

@@ -1,4 +1,4 @@
-"""The curves of a run, read from its `metrics.csv`, and those of several seeds put together."""
+"""Read curves from the `metrics.csv` of a run, and aggregate the curves of several seeds."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from merl.core.statistics import bootstrap_interval
 
 Array = NDArray[np.float64]
 Band = Literal["range", "bootstrap"]
-"""Around the mean of several seeds: the smallest to the largest, or the mean's 95 % bootstrap."""
+"""Band around the mean of the seeds: minimum to maximum, or the mean's 95 % bootstrap interval."""
 
 
 class Curve(NamedTuple):
     """One measured line.
 
     Attributes:
-        steps: where it was measured, ascending, (N,); environment steps, or what else x is.
-        values: what was measured there, (N,), without NaN.
+        steps: x, ascending, (N,); environment steps or another unit.
+        values: y, (N,), without NaN.
     """
 
     steps: Array
@@ -31,7 +31,7 @@ class Curve(NamedTuple):
 
 
 class Aggregate(NamedTuple):
-    """Several seeds on one grid.
+    """Curves of several seeds on one grid.
 
     Attributes:
         steps: the grid, (G,); it ends where the shortest seed ends.
@@ -49,19 +49,20 @@ class Aggregate(NamedTuple):
 
 
 def read_metrics(run: Path | str) -> dict[str, Array]:
-    """Every column of a run's metrics.
+    """Return all columns of a run's metrics.
 
-    A last line without its line end is left out: the run is writing it, or was killed doing so.
+    A last line without a line end is skipped: the run is still writing it, or was killed while it
+    wrote it.
 
     Args:
-        run: a run's folder, or a CSV file laid out like its `metrics.csv`.
+        run: a run folder, or a CSV file with the layout of `metrics.csv`.
 
     Returns:
-        name -> (N,) float64, in the order of the file, NaN where a row has no such number; `step`
-        is always there, N may be 0.
+        {name: (N,) float64}, in the order of the file, NaN for empty cells; it always has `step`,
+        N may be 0.
 
     Raises:
-        MerlError: no such file, or not a file of metrics.
+        MerlError: the file is missing, or it is not a file of metrics.
     """
     path = Path(run)
     path = path / METRICS_FILE if path.is_dir() else path
@@ -73,7 +74,7 @@ def read_metrics(run: Path | str) -> dict[str, Array]:
         whole = text[: text.rfind(b"\n") + 1].decode()
         columns, *lines = [*csv.reader(whole.splitlines(), strict=True)] or [["step"]]
         rows = [[float(cell) if cell else np.nan for cell in line] for line in lines]
-        # reshape, for rows of unequal length to fail and for no rows to have columns
+        # reshape rejects rows of unequal length, and gives an empty table its columns
         table = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
     except (ValueError, csv.Error) as error:
         raise MerlError(f"{path} is not a file of metrics: {error}") from None
@@ -83,47 +84,47 @@ def read_metrics(run: Path | str) -> dict[str, Array]:
 
 
 def curve(run: Path | str, name: str, x: str = "step") -> Curve:
-    """One column of a run against another, without the rows that lack either.
+    """Return one column of a run over another, without rows in which either is empty.
 
     Args:
-        run: as for `read_metrics`.
-        name: the column, e.g. `eval/return`.
-        x: the column that it is drawn over, e.g. `time/seconds`.
+        run: see `read_metrics`.
+        name: the column for y, e.g. `eval/return`.
+        x: the column for x, e.g. `time/seconds`.
 
     Returns:
-        The curve, ascending in x; empty if the run has no such columns yet.
+        The curve, ascending in x; empty if the run does not have these columns yet.
 
     Raises:
-        MerlError: as `read_metrics`.
+        MerlError: see `read_metrics`.
     """
     return curve_of(read_metrics(run), name, x)
 
 
 def curve_of(metrics: dict[str, Array], name: str, x: str = "step") -> Curve:
-    """As `curve`, of metrics that have been read already."""
+    """Return the same as `curve`, from metrics that `read_metrics` returned."""
     empty = np.full(len(metrics["step"]), np.nan)
     steps, values = metrics.get(x, empty), metrics.get(name, empty)
-    there = ~np.isnan(steps) & ~np.isnan(values)
-    order = np.argsort(steps[there], kind="stable")
-    return Curve(steps[there][order], values[there][order])
+    known = ~np.isnan(steps) & ~np.isnan(values)
+    order = np.argsort(steps[known], kind="stable")
+    return Curve(steps[known][order], values[known][order])
 
 
 def aggregate(
     curves: Sequence[Curve], grid: Array | None = None, band: Band = "range"
 ) -> Aggregate:
-    """Put the curves of several seeds together.
+    """Aggregate the curves of several seeds on one grid.
 
     Args:
-        curves: one a seed, none of them empty. Between its points a curve is a straight line.
-        grid: where to compare them, ascending, (G,). None: every step of any seed from where the
-            last seed begins to where the first one ends.
-        band: what surrounds the mean; of one seed it has no width.
+        curves: one curve per seed, none of them empty; interpolated linearly between their points.
+        grid: x values at which to compare them, ascending, (G,); values outside the range that all
+            seeds cover are skipped. None: all steps of all seeds in that range.
+        band: kind of the band around the mean; for one seed it has no width.
 
     Raises:
-        ValueError: no curve, an empty one, or no step that all of them reach.
+        ValueError: no curve, an empty curve, or no grid step that all curves cover.
     """
     if not curves or any(len(one.steps) == 0 for one in curves):
-        raise ValueError("seeds can be put together when each has a point")
+        raise ValueError("to aggregate seeds, give at least one curve, and none without points")
     begin = max(one.steps[0] for one in curves)
     end = min(one.steps[-1] for one in curves)
     if grid is None:
@@ -131,7 +132,7 @@ def aggregate(
     steps = np.asarray(grid, dtype=np.float64)
     steps = steps[(begin <= steps) & (steps <= end)]
     if len(steps) == 0:
-        raise ValueError("these seeds have no step in common")
+        raise ValueError("the curves of these seeds have no step in common")
     values = np.stack([np.interp(steps, one.steps, one.values) for one in curves])  # (S, G)
     mean = values.mean(axis=0)
     if band == "range":

@@ -1,4 +1,4 @@
-"""How pictures look: paper, colours, axes, and labels that stand at what they name."""
+"""Style of the figures: size, colours, axes, and labels beside the curves that they name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from matplotlib.ticker import EngFormatter, FixedLocator, MaxNLocator, PercentFo
 from merl.core import MerlError
 from merl.report.curves import Array, Curve
 
-# Okabe and Ito's palette: told apart by every kind of colour vision. Its yellow is too pale here.
+# Okabe and Ito's palette, for every kind of colour vision, without its yellow, which is too pale.
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = (
     "#0072B2",
     "#D55E00",
@@ -33,7 +33,7 @@ LABEL_SIZE = 9.0  # points
 
 
 class Label(NamedTuple):
-    """What stands right of a panel, at the height of what it names."""
+    """Text right of a panel, at the height of the line that it names."""
 
     text: str
     y: float
@@ -42,19 +42,19 @@ class Label(NamedTuple):
 
 
 def new_figure(height: float) -> Figure:
-    """An empty picture, 7.6 inches wide and `height` inches high."""
+    """Return an empty figure, 7.6 inches wide and `height` inches high."""
     figure = Figure(figsize=(7.6, height), dpi=DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def headline(figure: Figure, text: str) -> None:
-    """Write a title above everything."""
+    """Write a title above all panels."""
     figure.suptitle(text, x=0.012, ha="left", color=INK, size=12, weight="bold")
 
 
 def style(axes: Axes, ylabel: str) -> None:
-    """A panel with a light grid and no frame."""
+    """Give a panel a light grid and no frame."""
     axes.set_axisbelow(True)
     axes.grid(color=GRID, lw=0.8)
     axes.spines[["top", "right", "left"]].set_visible(False)
@@ -64,7 +64,7 @@ def style(axes: Axes, ylabel: str) -> None:
 
 
 def value_axis(axes: Axes, values: Sequence[float], rate: bool) -> None:
-    """The vertical axis: percent for a rate, else from 0 (or the lowest value) to the highest."""
+    """Scale the y axis: percent for a rate, else from 0, or the lowest value, to the highest."""
     if rate:
         axes.set_ylim(-0.03, 1.03)
         axes.set_yticks([0, 0.25, 0.5, 0.75, 1])
@@ -77,7 +77,7 @@ def value_axis(axes: Axes, values: Sequence[float], rate: bool) -> None:
 
 
 def step_axis(axes: Axes, steps: Array) -> None:
-    """The horizontal axis: environment steps, from 0 to the last."""
+    """Scale the x axis: environment steps, from 0 to the last."""
     axes.set_xlabel("environment steps", color=MUTED)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 2.5, 5, 10], integer=True))
@@ -85,14 +85,14 @@ def step_axis(axes: Axes, steps: Array) -> None:
 
 
 def time_axis(axes: Axes, seconds: Curve) -> None:
-    """Along the top, the wall-clock time at which a step was reached; steps need not be even."""
+    """Draw a second x axis on top: wall-clock time at each step; the speed may vary."""
     if len(seconds.steps) == 0 or seconds.values.max() <= 0:
         return
     unit, length = ("minutes", 60) if seconds.values.max() < 5 * 3600 else ("hours", 3600)
     passed = np.maximum.accumulate(seconds.values) / length
     reached = np.concatenate([[0.0], passed]), np.concatenate([[0.0], seconds.steps])
     ticks = np.asarray(MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(0, passed[-1]))
-    apart = 0.05 * axes.get_xlim()[1]  # steps; during a slow start the ticks would overlap
+    apart = 0.05 * axes.get_xlim()[1]  # in steps; keeps ticks of a slow start from overlapping
     shown: list[tuple[float, float]] = []  # (step, time)
     for tick in ticks[(ticks >= 0) & (ticks <= passed[-1])]:
         step = float(np.interp(tick, *reached))
@@ -107,10 +107,10 @@ def time_axis(axes: Axes, seconds: Curve) -> None:
 
 
 def direct_labels(figure: Figure, axes: Axes, labels: Sequence[Label]) -> None:
-    """Write labels right of a panel at the height of what they name, moved apart where needed."""
+    """Write labels right of a panel at their heights; move them apart where they overlap."""
     if not labels:
         return
-    figure.draw_without_rendering()  # the layout, for the height of the panel
+    figure.draw_without_rendering()  # computes the layout, and with it the panel's height
     points = axes.get_window_extent().height * 72 / figure.dpi
     heights = [LABEL_SIZE * 1.35 * (1 + label.text.count("\n")) / points for label in labels]
     bottom, top = axes.get_ylim()
@@ -131,19 +131,24 @@ def direct_labels(figure: Figure, axes: Axes, labels: Sequence[Label]) -> None:
 
 
 def _spread(wanted: Sequence[float], heights: Sequence[float]) -> list[float]:
-    """Centres for boxes of these heights, near the wanted ones, in their order, without overlap.
+    """Return centres for boxes that do not overlap, in the order of the wanted centres.
 
-    Boxes that touch are joined to a block about the mean of what they want, until none does.
+    Boxes that would overlap are joined to a block around the mean of their wanted centres, until no
+    blocks overlap.
+
+    Args:
+        wanted: the wanted centre of each box.
+        heights: the height of each box.
     """
     order = np.argsort(wanted, kind="stable")
     blocks: list[tuple[float, float, list[int]]] = []  # (centre, height, boxes from below)
     for i in order:
         centre, height, boxes = float(wanted[i]), heights[i], [int(i)]
         while blocks and blocks[-1][0] + blocks[-1][1] / 2 > centre - height / 2:
-            below, its_height, its_boxes = blocks.pop()
-            count = len(boxes) + len(its_boxes)
-            centre = (centre * len(boxes) + below * len(its_boxes)) / count
-            height, boxes = height + its_height, its_boxes + boxes
+            below, below_height, below_boxes = blocks.pop()
+            count = len(boxes) + len(below_boxes)
+            centre = (centre * len(boxes) + below * len(below_boxes)) / count
+            height, boxes = height + below_height, below_boxes + boxes
         blocks.append((centre, height, boxes))
     centres = [0.0] * len(wanted)
     for centre, height, boxes in blocks:
@@ -155,12 +160,19 @@ def _spread(wanted: Sequence[float], heights: Sequence[float]) -> list[float]:
 
 
 def number(value: float) -> str:
-    """Three digits, and no power of ten for what is next to nothing."""
+    """Format a value with three digits; values below 0.05 as "0"."""
     return f"{value:.3g}" if abs(value) >= 0.05 else "0"
 
 
 def save(figure: Figure, output: Path) -> Path:
-    """Write the picture to a temporary name first, so that none is ever half there."""
+    """Save a figure; write a temporary file first, so that `output` is never incomplete.
+
+    Returns:
+        `output`.
+
+    Raises:
+        MerlError: the file cannot be written, or its suffix is unknown.
+    """
     part = output.with_name(f".{output.stem}.part{output.suffix}")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -169,5 +181,5 @@ def save(figure: Figure, output: Path) -> Path:
     except (OSError, ValueError) as error:  # ValueError: a suffix that matplotlib does not know
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
-        raise MerlError(f"the picture {output} cannot be written: {error}") from None
+        raise MerlError(f"the figure {output} cannot be written: {error}") from None
     return output

@@ -1,4 +1,4 @@
-"""Pictures of learning, drawn from run folders."""
+"""Figures of learning curves, drawn from run folders."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from merl.report.drawing import (
     value_axis,
 )
 
-SMOOTHED_POINTS = 150  # more training episodes than this are drawn as means of several
+SMOOTHED_POINTS = 150  # a longer curve is drawn as means of several episodes
 
 Run = Path | str
 Reference = Mapping[str, float]
@@ -50,21 +50,21 @@ Reference = Mapping[str, float]
 def learning_curve(
     run_dir: Run, output: Path | str, *, references: Reference | None = None
 ) -> Path:
-    """Draw how one run learns: the return, and below it the success, over environment steps.
+    """Draw the learning curve of one run: return, and below it success, over environment steps.
 
-    Evaluations are drawn with their intervals, training episodes as a thin line behind them. What
-    the run has not measured is left out.
+    Evaluations are drawn with their intervals, training episodes as a thin line behind them.
+    Columns that the run does not have are skipped.
 
     Args:
-        run_dir: the run's folder, with `metrics.csv` and perhaps `config.json`.
-        output: the picture to make; its suffix says which kind (`.png`, `.svg`, `.pdf`).
-        references: label -> return, drawn as horizontal lines, e.g. {"random": 2.1}.
+        run_dir: the run's folder, with `metrics.csv` and, optionally, `config.json`.
+        output: the figure's file; its suffix sets the format (`.png`, `.svg`, `.pdf`).
+        references: {label: return}, drawn as horizontal lines, e.g. {"random": 2.1}.
 
     Returns:
         `output`.
 
     Raises:
-        MerlError: no metrics in `run_dir`, or `output` cannot be written.
+        MerlError: `run_dir` has no metrics, or `output` cannot be written.
     """
     metrics = read_metrics(run_dir)
     success = [name for name in ("eval/success_end", "eval/success_any") if name in metrics]
@@ -83,7 +83,7 @@ def learning_curve(
     step_axis(below, metrics["step"])
     if "time/seconds" in metrics:
         time_axis(above, curve_of(metrics, "time/seconds"))
-    headline(figure, f"{_title(run_dir)}{_what_is_missing(metrics)}")
+    headline(figure, f"{_title(run_dir)}{_missing_note(metrics)}")
     for axes, of_axes in labels.items():
         direct_labels(figure, axes, of_axes)
     return save(figure, Path(output))
@@ -99,28 +99,28 @@ def learning_curves(
     references: Reference | None = None,
     title: str = "",
 ) -> Path:
-    """Compare what several agents learn: the mean of each one's seeds, its band, and every seed.
+    """Draw the learning curves of several agents: each agent's mean, its band, and its seeds.
 
     Args:
-        runs: label -> its seeds: run folders, CSV files laid out like `metrics.csv`, or `Curve`s
-            whose `steps` are already in the unit of x.
-        output: the picture to make; its suffix says which kind (`.png`, `.svg`, `.pdf`).
-        x: environment steps, or minutes of wall-clock (column `time/seconds`).
-        name: the column to draw; a rate of success is drawn in percent.
-        band: what surrounds the mean of several seeds.
-        references: label -> value in the unit of the column, drawn as horizontal lines.
-        title: above the picture.
+        runs: {label: seeds}; a seed is a run folder, a CSV file with the layout of `metrics.csv`,
+            or a `Curve` whose `steps` are already in the unit of x.
+        output: the figure's file; its suffix sets the format (`.png`, `.svg`, `.pdf`).
+        x: environment steps, or minutes of wall-clock time (column `time/seconds`).
+        name: the column to draw; a success rate is drawn in percent.
+        band: kind of the band around the mean of several seeds.
+        references: {label: value in the unit of the column}, drawn as horizontal lines.
+        title: title of the figure.
 
     Returns:
         `output`.
 
     Raises:
-        MerlError: a file that is missing or malformed, nothing to draw, or an `output` that
-            cannot be written.
+        MerlError: a file is missing or malformed, there is nothing to draw, or `output` cannot be
+            written.
     """
     seeds = {label: _seeds(label, several, name, x) for label, several in runs.items()}
     if not seeds:
-        raise MerlError("no run to draw a learning curve of")
+        raise MerlError("no run given to draw a learning curve of")
     figure = new_figure(height=4.4)
     axes = figure.subplots()
     rate = "success" in name
@@ -145,7 +145,7 @@ def learning_curves(
     if title:
         headline(figure, title)
     if several_seeds:
-        around = "the smallest to the largest" if band == "range" else "its 95 % bootstrap interval"
+        around = "minimum to maximum" if band == "range" else "its 95 % bootstrap interval"
         note = f"bold: mean over the seeds; band: {around}; thin: each seed"
         axes.set_title(note, loc="left", color=MUTED, size=LABEL_SIZE)
     direct_labels(figure, axes, labels)
@@ -158,25 +158,25 @@ def reward_terms(
     *,
     references: Mapping[str, Reference] | None = None,
 ) -> Path:
-    """Draw which stage of its reward each run has learnt: a panel a run, a curve a term.
+    """Draw the terms of the reward over training: one panel per run, one curve per term.
 
-    A curve is the sum of a term over an episode of evaluation, `eval/reward/TERM`.
+    A curve shows the sum of a term over an evaluation episode, `eval/reward/TERM`.
 
     Args:
-        runs: label -> run folder, or a CSV file laid out like `metrics.csv`.
-        output: the picture to make.
-        references: term -> its sum for something else, by the label of the run; a dotted line in
-            the colour of the term, e.g. what an agent that does not move is paid.
+        runs: {label: run folder, or CSV file with the layout of `metrics.csv`}.
+        output: the figure's file.
+        references: {label of a run: {term: sum}}, e.g. the sums of an agent that does not move;
+            drawn as dotted lines in the colours of the terms.
 
     Returns:
         `output`.
 
     Raises:
-        MerlError: a file that is missing or malformed, a run whose rewards have no terms, or an
-            `output` that cannot be written.
+        MerlError: a file is missing or malformed, the rewards of a run have no terms, or `output`
+            cannot be written.
     """
     if not runs:
-        raise MerlError("no run to draw the reward of")
+        raise MerlError("no run given to draw the reward of")
     figure = new_figure(height=2.9 * len(runs))
     panels = np.atleast_1d(figure.subplots(len(runs), 1))
     labels: dict[Axes, list[Label]] = {}
@@ -184,19 +184,19 @@ def reward_terms(
         metrics = read_metrics(run)
         names = [name for name in metrics if name.startswith("eval/reward/")]
         if not names:
-            raise MerlError(f"{label}: {run} has no terms of a reward")
+            raise MerlError(f"{label}: {run} has no terms of a reward (columns eval/reward/...)")
         style(axes, "sum over an episode")
         axes.set_title(label, loc="left", color=INK, size=LABEL_SIZE + 1, weight="bold")
         labels[axes] = []
-        beside = (references or {}).get(label, {})
+        sums = (references or {}).get(label, {})
         for name, color in zip(names, PALETTE, strict=False):
             term, drawn = name.removeprefix("eval/reward/"), curve_of(metrics, name)
             axes.plot(*drawn, color=color, lw=1.8)
-            if term in beside:
-                axes.axhline(beside[term], color=color, lw=1.0, ls=":", zorder=1.2)
+            if term in sums:
+                axes.axhline(sums[term], color=color, lw=1.0, ls=":", zorder=1.2)
             last = drawn.values[-1]
             labels[axes].append(Label(f"{term} {number(last)}", last, color, "bold"))
-        value_axis(axes, list(beside.values()), False)
+        value_axis(axes, list(sums.values()), False)
         step_axis(axes, metrics["step"])
     for axes, of_axes in labels.items():
         direct_labels(figure, axes, of_axes)
@@ -204,7 +204,7 @@ def reward_terms(
 
 
 def _seeds(label: str, runs: Sequence[Run | Curve], name: str, x: str) -> list[Curve]:
-    """The curve of each seed; steps, or minutes."""
+    """Return the curve of each seed, over steps or minutes."""
     curves = []
     for run in runs:
         if isinstance(run, Curve):
@@ -218,12 +218,12 @@ def _seeds(label: str, runs: Sequence[Run | Curve], name: str, x: str) -> list[C
             raise MerlError(f"{label}: no {name} over {x} in {run}")
         curves.append(one)
     if not curves:
-        raise MerlError(f"{label}: no run")
+        raise MerlError(f"{label}: no run given")
     return curves
 
 
 def _together(curves: Sequence[Curve], band: Band) -> Aggregate | None:
-    """The seeds as one; None if there is but one, or if they have no step in common."""
+    """Return the aggregated seeds; None for a single seed or without a common step."""
     if len(curves) < 2:
         return None
     try:
@@ -235,7 +235,7 @@ def _together(curves: Sequence[Curve], band: Band) -> Aggregate | None:
 def _draw_seeds(
     axes: Axes, curves: Sequence[Curve], together: Aggregate | None, color: str, dash: str
 ) -> float:
-    """Draw the seeds of one label; returns the height at which the label belongs."""
+    """Draw the seeds of one label; return the height of the label."""
     if together is None:
         for one in curves:
             marker = "o" if len(one.steps) < 3 else ""
@@ -282,7 +282,7 @@ def _draw_success(axes: Axes, metrics: dict[str, Array]) -> list[Label]:
 
 
 def _draw_with_interval(axes: Axes, metrics: dict[str, Array], name: str, color: str) -> Curve:
-    """Draw a column of evaluations and, where both its ends are known, the interval around it."""
+    """Draw a column of evaluations and its interval, if both ends are in the metrics."""
     drawn = curve_of(metrics, name)
     low, high = curve_of(metrics, f"{name}_low"), curve_of(metrics, f"{name}_high")
     if len(drawn.steps) == 0:
@@ -292,7 +292,7 @@ def _draw_with_interval(axes: Axes, metrics: dict[str, Array], name: str, color:
     elif len(low.steps) == len(high.steps) == 1:
         axes.vlines(low.steps, low.values, high.values, color=color, alpha=0.5, lw=2)
     marker = "o" if len(drawn.steps) <= 40 else ""
-    # not clipped, for the last marker to be whole: it sits on the panel's edge
+    # not clipped: the last marker lies on the panel's edge
     axes.plot(*drawn, color=color, lw=2.0, marker=marker, ms=3.5, zorder=3, clip_on=False)
     return drawn
 
@@ -311,7 +311,7 @@ def _draw_references(axes: Axes, references: Reference, rate: bool = False) -> l
 
 
 def _smooth(of: Curve) -> tuple[Curve, int]:
-    """A long curve as means over equally many neighbours, and how many; a short one as it is."""
+    """Return a curve as means over groups of points, and the group size; a short curve as it is."""
     per_point = -(-len(of.steps) // SMOOTHED_POINTS)
     if per_point <= 1:
         return of, 1
@@ -320,7 +320,7 @@ def _smooth(of: Curve) -> tuple[Curve, int]:
 
 
 def _axis_name(name: str) -> str:
-    """`eval/return` -> "evaluation return"."""
+    """Return a column's name in words: `eval/return` -> "evaluation return"."""
     special = {"eval/success_end": "success at the end", "eval/success_any": "success at any time"}
     room, _, what = name.partition("/")
     words = {"eval": "evaluation", "train": "training"}
@@ -331,9 +331,9 @@ _TITLE = ("task", "agent", "preset", "setting")
 
 
 def _title(run_dir: Run) -> str:
-    """Task, agent, preset and seed from the run's `config.json`, as far as it tells them.
+    """Return task, agent, preset and seed from the run's `config.json`, as far as it has them.
 
-    Whose settings a baseline has is told too: it is not the same method with others.
+    For a baseline, add the setting (matched or published).
     """
     path = Path(run_dir)
     try:
@@ -349,7 +349,7 @@ def _title(run_dir: Run) -> str:
     return " · ".join(parts) or name.resolve().name
 
 
-def _what_is_missing(metrics: dict[str, Array]) -> str:
+def _missing_note(metrics: dict[str, Array]) -> str:
     if len(curve_of(metrics, "eval/return").steps):
         return ""
     trained = len(curve_of(metrics, "train/return").steps) > 0

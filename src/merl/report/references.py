@@ -1,7 +1,7 @@
-"""What a return is to be compared with: acting at random, not acting, a scripted expert.
+"""Reference returns of merl's tasks: random actions, no motion, a scripted expert.
 
-The numbers lie in `references.json`, which `benchmarks/measure_references.py` writes; those of
-others are quoted with their source.
+The numbers are in `references.json`, which `benchmarks/measure_references.py` writes. Published
+numbers are quoted with their source.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from merl.core.statistics import Interval
 from merl.envs.config import EnvConfig
 
 RANDOM = "random actions"
-"""The reference that acts at random."""
+"""Name of the reference with random actions."""
 EXPERT = "scripted expert"
-"""The reference that solves the task with the simulator's state."""
+"""Name of the reference that solves the task with the simulator's state."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """How something else does on a task.
+    """Result of a policy on a task, for comparison.
 
     Attributes:
-        name: what it is, e.g. "random actions".
-        returns: its mean return with a 95 % interval; without one both ends are the mean.
-        success_end: its rate of success at the end of the episode, likewise; None if not known.
-        source: where the number comes from.
-        terms: the mean sum of each of the reward's terms over an episode; empty if not known.
+        name: name of the policy, e.g. "random actions".
+        returns: mean return with a 95 % interval; if the interval is unknown, both ends are the
+            mean.
+        success_end: rate of success at the end of the episode, in the same form; None if unknown.
+        source: origin of the numbers.
+        terms: {term of the reward: its mean sum over an episode}; empty if unknown.
     """
 
     name: str
@@ -41,11 +42,11 @@ class Reference:
 
 
 def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]:
-    """The references of a task, from the least to the best; none where none were measured.
+    """Return the references of a task, from the lowest to the highest; empty if not measured.
 
     Args:
         task: the task's name.
-        env: its form; which are measured, `benchmarks/measure_references.py` says.
+        env: the form of the task; `benchmarks/measure_references.py` lists the measured forms.
     """
     return tuple(
         Reference(
@@ -60,14 +61,14 @@ def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]
 
 
 def form(task: str, env: EnvConfig) -> str:
-    """A task's name and what makes it another task, e.g. "move_box around+holding staged"."""
+    """Return a task's name and the options that change it: "move_box around+holding staged"."""
     plain = EnvConfig()
     parts = {
         "occluded": "occluded",
         "start": "+".join(env.start),
         "reward": env.reward,
     }
-    changed = (told for name, told in parts.items() if getattr(env, name) != getattr(plain, name))
+    changed = (text for name, text in parts.items() if getattr(env, name) != getattr(plain, name))
     return " ".join([task, *changed])
 
 

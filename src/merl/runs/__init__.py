@@ -1,1 +1,1 @@
-"""A run's folder: config, checkpoints, metrics, and where it came from."""
+"""The folder of a run: config, checkpoints, metrics and provenance."""

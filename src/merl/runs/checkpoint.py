@@ -1,9 +1,9 @@
-"""Checkpoints: folders that are whole or not there at all.
+"""Checkpoints: folders that are written atomically.
 
 `checkpoints/00010000/` holds `weights.safetensors` (networks and target), `learner.pt` (optimizers
-and random generators; read with `weights_only=True`), `state.json` (where the run stood) and
-`manifest.json` (sizes and SHA-256 of the others). It is written under a temporary name, flushed to
-the disk, then renamed.
+and random generators; read with `weights_only=True`), `state.json` (progress of the run) and
+`manifest.json` (sizes and SHA-256 of the other files). The folder is written under a temporary
+name, flushed to disk, then renamed.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint on the disk, checked against its manifest.
+    """A checkpoint on disk, verified against its manifest.
 
     Attributes:
-        path: its folder.
-        step: environment steps at which it was taken.
-        score: the evaluation return at that step, if there was one.
+        path: the folder of the checkpoint.
+        step: environment steps at which it was saved.
+        score: the evaluation return at that step; None if there was no evaluation.
     """
 
     path: Path
@@ -64,7 +64,8 @@ class Checkpoint:
         """Read the manifest and check every file against it.
 
         Raises:
-            MerlError: a file is missing, cut short or changed.
+            MerlError: the manifest cannot be read or has another format, or a file is missing,
+                truncated or changed.
         """
         try:
             manifest = json.loads((path / _MANIFEST).read_text())
@@ -79,7 +80,10 @@ class Checkpoint:
         except (OSError, LookupError, ArithmeticError, *_BAD_VALUES) as error:
             raise MerlError(f"checkpoint {path} has no readable manifest ({error})") from None
         if number != FORMAT:
-            raise MerlError(f"checkpoint {path} has format {number}, this merl reads {FORMAT}")
+            raise MerlError(
+                f"checkpoint {path} has format {number}, but this version of merl reads format "
+                f"{FORMAT}"
+            )
         for name, expected in files.items():
             try:
                 whole = _fingerprint(path / name) == expected
@@ -91,36 +95,42 @@ class Checkpoint:
 
     @classmethod
     def find(cls, root: Path, which: str = "latest") -> Checkpoint:
-        """The "latest" whole checkpoint, the "best", or the one of a number of steps.
+        """Find a checkpoint and verify it.
+
+        Damaged checkpoints are skipped with a warning, unless one is selected by its step.
+
+        Args:
+            root: the folder that holds the checkpoints of a run.
+            which: "latest", "best" (by score), or a number of steps.
 
         Raises:
-            MerlError: there is none.
+            MerlError: there is no such checkpoint, or the selected one is damaged.
         """
         if which not in ("latest", "best"):
             named = {str(int(path.name)): path for path in _folders(root)}
             if which not in named:
-                there = ", ".join(["latest", "best", *named])
-                raise MerlError(f"checkpoint {which!r} is not there: choose from {there}")
+                choices = ", ".join(["latest", "best", *named])
+                raise MerlError(f"checkpoint {which!r} does not exist: choose from {choices}")
             return cls.open(named[which])
         whole = []
         for path in reversed(_folders(root)):
             try:
                 whole.append(cls.open(path))
             except MerlError as error:
-                _LOG.warning("%s: passed over", error)
+                _LOG.warning("%s: checkpoint skipped", error)
                 continue
             if which == "latest":
                 return whole[0]
         scored = [checkpoint for checkpoint in whole if checkpoint.score is not None]
         if not whole:
-            raise MerlError(f"no whole checkpoint in {root}: the run ended before its first one")
+            raise MerlError(f"no complete checkpoint in {root}: the run ended before it saved one")
         return max(scored, key=lambda c: (c.score, c.step)) if scored else whole[0]
 
     def state(self) -> dict[str, Any]:
-        """Return the state that `save` was given.
+        """Return the `state` argument of `save`.
 
         Raises:
-            MerlError: the file cannot be read, or does not have the form that merl writes.
+            MerlError: the file cannot be read or does not hold a dict.
         """
         with readable(self):
             state: dict[str, Any] = json.loads((self.path / _STATE).read_text())
@@ -138,24 +148,24 @@ def save(
     score: float | None,
     keep: int,
 ) -> Checkpoint:
-    """Write a checkpoint, then let go of old ones but the last `keep` and the best.
+    """Write a checkpoint, then delete old ones except the last `keep` and the best.
 
     Args:
-        root: the run's folder of checkpoints.
+        root: the folder that holds the checkpoints of the run.
         step: environment steps so far.
-        agent: whose state is saved.
-        state: plain types, to be kept beside the agent.
-        score: the evaluation return at this step, if there was an evaluation.
-        keep: how many of the last ones to keep.
+        agent: the agent to save.
+        state: further state to save, as plain types for JSON.
+        score: the evaluation return at this step; None if there was no evaluation.
+        keep: number of recent checkpoints to keep.
 
     Raises:
-        OSError: it could not be written; the former ones are untouched.
-        NotFinite: a weight is a NaN or an infinity; so are they then.
+        OSError: the checkpoint could not be written; earlier checkpoints are unchanged.
+        NotFinite: a weight is NaN or infinite; earlier checkpoints are unchanged.
     """
     with torch_settings(_CPU):
         learnt = agent.state_dict()
         check_weights({group: learnt[group] for group in _WEIGHT_GROUPS})
-    root.mkdir(exist_ok=True)  # no parents: a run's folder that was taken away stays away
+    root.mkdir(exist_ok=True)  # no parents: do not recreate a run folder that was deleted
     part = root / f".part-{step:08d}"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
@@ -174,7 +184,7 @@ def save(
             _sync(path)
         final = root / f"{step:08d}"
         former = root / f".part-{step:08d}-former"
-        if final.exists():  # there until the very moment at which the new one takes its place
+        if final.exists():  # keep the old one until the new one replaces it
             final.rename(former)
         try:
             part.rename(final)
@@ -191,10 +201,10 @@ def save(
 
 
 def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
-    """Give an agent the weights, optimizers and generators of a checkpoint, to learn on.
+    """Restore an agent to continue training: weights, optimizers and random generators.
 
     Raises:
-        MerlError: a file cannot be read, or belongs to other networks.
+        MerlError: a file cannot be read, or does not match the agent's networks.
     """
     with readable(checkpoint), torch_settings(_CPU):
         learner = _learner(checkpoint)
@@ -202,10 +212,10 @@ def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
 
 
 def load_networks(networks: nn.Module, checkpoint: Checkpoint) -> None:
-    """Give networks the weights of a checkpoint, to act with; it may be from another device.
+    """Load the weights of a checkpoint into networks; it may come from another device.
 
     Raises:
-        MerlError: a file cannot be read, or belongs to other networks.
+        MerlError: a file cannot be read, or does not match the networks.
     """
     with readable(checkpoint), torch_settings(_CPU):
         networks.load_state_dict(_weights(checkpoint)["networks"])
@@ -213,10 +223,10 @@ def load_networks(networks: nn.Module, checkpoint: Checkpoint) -> None:
 
 @contextmanager
 def readable(checkpoint: Checkpoint) -> Iterator[None]:
-    """Say in one line why a checkpoint cannot be read.
+    """Convert an error inside the block into a one-line error about the checkpoint.
 
     Raises:
-        MerlError: something in here failed to read the checkpoint.
+        MerlError: the block failed to read the checkpoint.
     """
     try:
         yield
@@ -237,10 +247,11 @@ def readable(checkpoint: Checkpoint) -> Iterator[None]:
 
 
 def _learner(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Optimizers and generators: tensors and plain values only, nothing is unpickled.
+    """Load optimizers and generators; only tensors and plain values, no pickled objects.
 
     Raises:
-        MerlError: the file holds something else. torch would advise to unpickle it all the same.
+        MerlError: the file holds something else. The message of torch, which recommends to unpickle
+            the file, is not passed on.
     """
     path = checkpoint.path / _LEARNER
     try:
@@ -253,8 +264,8 @@ def _learner(checkpoint: Checkpoint) -> dict[str, Any]:
     except Exception:
         pass
     raise MerlError(
-        f"checkpoint {checkpoint.path} cannot be loaded: {_LEARNER} holds something else than the "
-        "tensors and plain values that merl writes; loading that could run code"
+        f"checkpoint {checkpoint.path} cannot be loaded: {_LEARNER} holds something other than "
+        "tensors and plain values; loading it could run code: use another checkpoint"
     )
 
 
@@ -278,14 +289,14 @@ def _write(folder: Path, agent: Mapping[str, Any], state: Mapping[str, Any]) -> 
     }
     learner = io.BytesIO()
     torch.save({k: v for k, v in agent.items() if k not in _WEIGHT_GROUPS}, learner)
-    # Python writes the bytes: a full disk is then an OSError, whatever the format.
+    # Write the bytes from Python, so that a full disk raises OSError for every format.
     (folder / _WEIGHTS).write_bytes(to_bytes(weights))
     (folder / _LEARNER).write_bytes(learner.getbuffer())
     (folder / _STATE).write_text(json.dumps(state))
 
 
 def _folders(root: Path) -> list[Path]:
-    """Checkpoints by step, oldest first."""
+    """Return the folders of checkpoints in the order of their steps."""
     if not root.is_dir():
         return []
     folders = [path for path in root.iterdir() if path.is_dir() and _is_number(path.name)]
@@ -297,9 +308,10 @@ def _is_number(name: str) -> bool:
 
 
 def _prune(root: Path, step: int, keep: int) -> None:
-    """Let go of what is neither among the last nor the best.
+    """Delete all checkpoints except the last `keep` and the best.
 
-    A checkpoint of a later step was passed over as damaged when the run went on from before it.
+    Checkpoints of later steps than `step` are deleted, too: they were skipped as damaged when the
+    run resumed from an earlier one.
     """
     folders = _folders(root)
     past = [path for path in folders if int(path.name) <= step]
@@ -326,7 +338,7 @@ def _fingerprint(path: Path) -> dict[str, Any]:
 
 
 def _sync(path: Path) -> None:
-    """Have a file, or a folder's list of names, reach the disk."""
+    """Flush a file, or the directory entries of a folder, to disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

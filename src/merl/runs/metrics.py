@@ -1,8 +1,9 @@
-"""The numbers of a run, written while it goes on: `metrics.csv` and TensorBoard events.
+"""Metrics of a run, written during training: `metrics.csv` and TensorBoard events.
 
-`metrics.csv` is the truth: one row per environment step at which something was measured, `step`
-first, one column per name, an empty cell where a name was not measured. TensorBoard shows the same
-names. Neither may end a run: what cannot be written is kept in memory and written when it can be.
+`metrics.csv` is authoritative: one row per environment step at which something was measured, first
+the column `step`, then one column per metric; a cell is empty if the metric was not measured at
+that step. TensorBoard shows the same metrics. A failed write never ends a run: the rows are kept in
+memory and written as soon as that is possible.
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ _LOG = logging.getLogger(__name__)
 
 
 class MetricsWriter:
-    """Appends the numbers of a run to its folder; a context manager.
+    """Writer of the metrics of a run; a context manager.
 
-    The rows are also held in memory (a few MB for the longest run), so the file can be rewritten
-    whole, to a temporary name and then renamed, when a new column appears, when rows are dropped,
-    or after a failed write. Between those a row is one `write` of one line, so a killed process
-    leaves at most a torn last line, which reopening removes.
+    All rows are also held in memory (a few MB for the longest run). If a new column appears, rows
+    are dropped, or a write has failed, the whole file is written to a temporary name and renamed.
+    Otherwise each row is one `write` of one line, so a killed process leaves at most an incomplete
+    last line, which is removed when the file is opened again.
 
     Args:
-        run_dir: the run's folder; made if missing. An existing `metrics.csv` is continued.
-        warn: is told, once, in one line, that the numbers cannot be written (a full disk).
+        run_dir: the folder of the run; created if missing. An existing `metrics.csv` is continued.
+        warn: receives one message, once, if metrics cannot be written (e.g. the disk is full).
 
     Raises:
-        MerlError: `metrics.csv` is there but cannot be read, or is not a file of metrics.
+        MerlError: `metrics.csv` exists but cannot be read, or is not a metrics file.
     """
 
     def __init__(
@@ -53,17 +54,17 @@ class MetricsWriter:
         self._warned = False
         self._closed = False
         self._columns, self._rows = _read_rows(self._path)
-        self._written = 0  # rows that the file holds as memory does
-        self._tail = 0  # byte at which the last row's line begins
-        self._file: io.FileIO | None = None  # None: the file is behind memory, rewrite it whole
+        self._written = 0  # number of rows that the file holds
+        self._tail = 0  # byte offset of the last row
+        self._file: io.FileIO | None = None  # None: outdated, rewrite the whole file
         self._events: _EventFile | None = None
-        # Only here: a folder that is taken away during the run stays away.
+        # Only here: a folder that is deleted during the run is not created again.
         self._guard(lambda: self._path.parent.mkdir(parents=True, exist_ok=True))
         self._guard(lambda: self._rewrite(None))
         self._guard(self._open_events)
 
     def __enter__(self) -> Self:
-        """The writer itself."""
+        """Return the writer."""
         return self
 
     def __exit__(
@@ -72,32 +73,33 @@ class MetricsWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close, whatever happened."""
+        """Close the writer, also after an exception."""
         self.close()
 
     @property
     def last_step(self) -> int | None:
-        """The last step that has a row; None if there is no row."""
+        """Return the step of the last row; None if there is no row."""
         return int(self._rows[-1]["step"]) if self._rows else None
 
     @property
     def unwritten(self) -> int:
-        """How many rows are in memory alone, since they could not be written."""
+        """Return the number of rows in memory that could not be written to the file."""
         return len(self._rows) - self._written
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Record what was measured at `step`.
+        """Record the metrics of `step`.
 
-        A second call with the same step adds to that step's row (a name given twice keeps its
-        later value), so that every step has one row. Nothing is written for no values.
+        A second call with the same step adds to the row of that step, so that every step has one
+        row; the later value of a metric replaces the earlier one. Without values, nothing is
+        written.
 
         Args:
-            step: environment steps so far, at least that of the last row.
-            values: name -> value; names like `train/return`, on one line, never `step`.
+            step: environment steps so far; at least the step of the last row.
+            values: name -> value; names like `train/return`, printable, and not `step`.
 
         Raises:
-            ValueError: a step before the last one (after resuming, call `trim` first), a name
-                that cannot be a column, or a closed writer.
+            ValueError: the step is before the last row (after a resume, call `trim` first), a
+                name cannot be a column, or the writer is closed.
         """
         if self._closed:
             raise ValueError(f"the writer of {self._path} is closed")
@@ -105,7 +107,7 @@ class MetricsWriter:
             return
         last = self.last_step
         if last is not None and step < last:
-            raise ValueError(f"step {step} comes after step {last}: trim({step}) first")
+            raise ValueError(f"step {step} is before the last step {last}: call trim({step}) first")
         numbers = {name: float(value) for name, value in values.items()}
         for name in numbers:
             if not name or name == "step" or not name.isprintable():
@@ -126,9 +128,9 @@ class MetricsWriter:
         self._guard(lambda: self._log_events(step, numbers))
 
     def trim(self, step: int) -> None:
-        """Drop every row after `step`: call it when a run goes on from a checkpoint of `step`.
+        """Drop every row after `step`: call it when a run resumes from a checkpoint of `step`.
 
-        TensorBoard is told to forget the same part.
+        TensorBoard drops the same events.
 
         Args:
             step: the last step to keep.
@@ -142,7 +144,7 @@ class MetricsWriter:
             self._guard(lambda: self._forget_events(step))
 
     def close(self) -> None:
-        """Bring the numbers safely to disk and close the files; may be called twice."""
+        """Flush all metrics to disk and close the files; may be called twice."""
         if self._closed:
             return
         self._closed = True
@@ -155,7 +157,7 @@ class MetricsWriter:
             self._guard(self._events.close)
 
     def _guard(self, action: Callable[[], None]) -> None:
-        """Do something with files; if they fail, the run goes on and its user hears of it once."""
+        """Run a file operation; if it fails, warn the user once and continue."""
         try:
             action()
         except OSError as error:
@@ -163,8 +165,8 @@ class MetricsWriter:
                 self._warned = True
                 reason = error.strerror or str(error)
                 self._warn(
-                    f"metrics cannot be written to {self._path.parent} ({reason}); training goes "
-                    "on, the numbers are kept in memory and written as soon as they can be"
+                    f"metrics cannot be written to {self._path.parent} ({reason}); training "
+                    "continues, and they are kept in memory until they can be written"
                 )
 
     def _sync(self) -> None:
@@ -172,19 +174,20 @@ class MetricsWriter:
         os.fsync(self._file.fileno())
 
     def _take_file(self) -> io.FileIO | None:
-        """The file, before memory changes; it is put back when it has followed.
+        """Return the open file and set `_file` to None before the rows in memory change.
 
-        Whatever comes between, an interrupt too, the file then counts as behind.
+        The next successful write sets `_file` again. If an interrupt prevents it, the file counts
+        as outdated.
         """
         file, self._file = self._file, None
         return file
 
     def _end(self) -> int:
-        """Bytes in the file now."""
+        """Return the size of the file in bytes."""
         return 0 if self._file is None else self._file.seek(0, io.SEEK_END)
 
     def _put_last_row(self, file: io.FileIO, begin: int) -> None:
-        """Write the last row's line at byte `begin`, in one piece; nothing remains behind it."""
+        """Write the last row at byte `begin` in one write, and truncate the file after it."""
         try:
             _write_whole(file, _csv_line(self._cells(self._rows[-1])), begin)
         except BaseException:
@@ -194,7 +197,7 @@ class MetricsWriter:
         self._written = len(self._rows)
 
     def _rewrite(self, old: io.FileIO | None) -> None:
-        """Write every row to a temporary file, put it in place of `metrics.csv`, and open that."""
+        """Write all rows to a temporary file, replace `metrics.csv` by it, and open it."""
         if old is not None:
             old.close()
         lines = [_csv_line(self._columns), *(_csv_line(self._cells(row)) for row in self._rows)]
@@ -232,11 +235,12 @@ class MetricsWriter:
 
 
 class _EventFile:
-    """One TensorBoard event file, written in whole records and flushed after each.
+    """One TensorBoard event file; each record is written completely and without a buffer.
 
-    TensorBoard's own `EventFileWriter`, which is under torch's `SummaryWriter`, writes from a
-    background thread; on a full disk that thread dies with a traceback across the live view. Its
-    record format is used directly instead; that leaves an installed TensorFlow alone, too.
+    TensorBoard's own `EventFileWriter`, which torch's `SummaryWriter` uses, writes from a
+    background thread. On a full disk that thread dies and prints a traceback across the live view.
+    Therefore this class writes TensorBoard's record format directly. It also does not import an
+    installed TensorFlow.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -249,7 +253,7 @@ class _EventFile:
         self._summary_pb2: Any = summary_pb2
         self._record_writer: Any = RecordWriter
         folder.mkdir(exist_ok=True)
-        # The order of names is the order in which TensorBoard reads them, so time comes first.
+        # TensorBoard reads the files in the order of their names, so the time comes first.
         stamp = f"{time.time_ns() / 1e9:020.9f}.{socket.gethostname()}.{os.getpid()}"
         self._file = io.FileIO(folder / f"events.out.tfevents.{stamp}", "w")
         try:
@@ -259,13 +263,13 @@ class _EventFile:
             raise
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Record the values of one step."""
+        """Write the values of one step."""
         Summary = self._summary_pb2.Summary  # noqa: N806 - a class
         tagged = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
         self._append(step=step, summary=Summary(value=tagged))
 
     def forget_from(self, step: int) -> None:
-        """Tell TensorBoard to drop what earlier files hold at `step` and after it."""
+        """Make TensorBoard drop the events of earlier files at `step` and later."""
         log = self._event_pb2.SessionLog
         self._append(step=step, session_log=log(status=log.START))
 
@@ -280,7 +284,10 @@ class _EventFile:
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Columns and rows (name -> text of a cell) of a metrics file, without a torn last line."""
+    """Return columns and rows (name -> cell text) of a metrics file.
+
+    An incomplete last line is left out.
+    """
     try:
         text = path.read_bytes()
     except FileNotFoundError:
@@ -300,8 +307,8 @@ def _read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
         columns, rows, steps = [], [], []
     if columns[:1] != ["step"] or steps != sorted(set(steps)):
         raise MerlError(
-            f"{path} is not a file of metrics that can be continued (a line that does not fit its "
-            "first, or steps out of order); move it away"
+            f"{path} is not a metrics file that can be continued (a line does not match the "
+            "header, or the steps are out of order): move it away"
         )
     return columns, rows
 
@@ -313,7 +320,7 @@ def _csv_line(cells: Iterable[str]) -> bytes:
 
 
 def _write_whole(file: io.FileIO, data: bytes, begin: int) -> None:
-    """Let the file end with `data` from byte `begin` on, or, if that fails, at `begin`."""
+    """Write `data` at byte `begin` and truncate after it; on failure truncate at `begin`."""
     file.seek(begin)
     try:
         if (file.write(data) or 0) < len(data):
@@ -325,5 +332,5 @@ def _write_whole(file: io.FileIO, data: bytes, begin: int) -> None:
 
 
 def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):  # where nothing can be written, perhaps nor removed
+    with contextlib.suppress(OSError):  # a disk that is not writable may also refuse to delete
         path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Configs and spaces as JSON knows them, and back."""
+"""Conversion of configs and spaces to plain types for JSON, and back."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def to_plain(config: Any) -> dict[str, Any]:
-    """A config as JSON knows it."""
+    """Convert a config to plain types for JSON."""
     plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     return plain
 
@@ -27,17 +27,17 @@ def from_plain(cls: type[T], plain: Mapping[str, Any], **narrower: type) -> T:
 
     Args:
         cls: the dataclass.
-        plain: its values.
-        **narrower: the type of a field that is annotated with a base of it.
+        plain: the values of its fields.
+        **narrower: for a field that is annotated with a base class, the subclass to restore.
 
     Raises:
-        TypeError: a value is not of its field's type, or a field is unknown: without it the run
-            would silently continue as another one.
+        TypeError: a value does not have the type of its field, or a field is unknown. Unknown
+            fields are not ignored, since the run would then silently change.
     """
     hints = typing.get_type_hints(cls) | narrower
     for name in plain:
         if name not in hints:
-            raise TypeError(f"{name} is not known to this version of merl")
+            raise TypeError(f"{name} is unknown to this version of merl")
     known = {name: _restore(name, hints[name], value) for name, value in plain.items()}
     return cls(**known)
 
@@ -59,12 +59,12 @@ def _restore(name: str, hint: Any, value: Any) -> Any:
     if not isinstance(value, plain.get(origin, (origin,))) or (
         isinstance(value, bool) and origin is not bool
     ):
-        raise TypeError(f"{name} is {value!r}")
+        raise TypeError(f"{name} is {value!r}, which is not of the type that merl writes")
     return value
 
 
 def told(described: Mapping[str, Any]) -> str:
-    """A described box in a few words; of bytes also the bounds, by which an image is scaled."""
+    """Return type and shape of a box as text; for uint8 also the bounds, which scale an image."""
     words = f"{described['dtype']} {tuple(described['shape'])}"
     if described["dtype"] == "uint8" and described["bounds"]:
         words += " from {:g} to {:g}".format(*described["bounds"])
@@ -72,7 +72,10 @@ def told(described: Mapping[str, Any]) -> str:
 
 
 def describe(space: spaces.Space[Any]) -> dict[str, Any]:
-    """Shape, type and bounds; JSON knows no infinity, so a box without bounds has none."""
+    """Return shape, type and bounds of a box as plain types.
+
+    The bounds are None if they are not finite, since JSON has no infinity.
+    """
     assert isinstance(space, spaces.Box)
     bounds = (float(space.low.min()), float(space.high.max()))
     return {
@@ -83,7 +86,7 @@ def describe(space: spaces.Space[Any]) -> dict[str, Any]:
 
 
 def box(described: Mapping[str, Any]) -> spaces.Box:
-    """The box that was described."""
+    """Restore a box from `describe()`."""
     dtype: Any = np.dtype(described["dtype"]).type
     low, high = described["bounds"] or (-np.inf, np.inf)
     return spaces.Box(low, high, tuple(described["shape"]), dtype)

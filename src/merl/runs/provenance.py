@@ -1,4 +1,4 @@
-"""What a result was made with and on: versions, commit, processor."""
+"""Provenance of a result: package versions, commit, machine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PACKAGES = (
 
 
 def package_versions(*others: str) -> dict[str, str]:
-    """The versions of what a result depends on, and of other packages that it may depend on."""
+    """Return the versions of Python, of `PACKAGES` and of further packages."""
     found = {"python": platform.python_version()}
     for name in (*PACKAGES, *others):
         try:
@@ -36,7 +36,7 @@ def package_versions(*others: str) -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """What it runs on."""
+    """Describe the machine: processor, cores, CPU instructions, GPU."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {
         "processor": _processor_name(),
@@ -47,7 +47,7 @@ def machine() -> dict[str, Any]:
 
 
 def _processor_name() -> str:
-    """The processor's own name, where the system tells it."""
+    """Return the model name of the processor, or else a generic name."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -58,7 +58,7 @@ def _processor_name() -> str:
 
 
 def commit() -> str | None:
-    """The commit of the source, where it runs from a checkout."""
+    """Return the commit of the source; None if merl does not run from a Git checkout."""
     source = Path(merl.__file__).parent
     command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=12"]
     try:

@@ -1,4 +1,4 @@
-"""What may change when a run goes on, and what makes it another run."""
+"""Config changes that are allowed when a run resumes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ HARMLESS = (
     "agent.precision",
     "agent.torch_compile",
 )
-"""Fields that may change: they decide how long, how fast and how closely watched, not what."""
+"""Fields that may change on resume: they affect the length, speed and monitoring of a run, but not
+what it learns."""
 _LEFT_OPEN = {
     "device": "auto",
     "threads": None,
@@ -38,28 +39,31 @@ _LEFT_OPEN = {
     "agent.vectors": None,
     "agent.critic_high": None,
 }
-"""Values that leave a field open: the machine decides, and what it has decided is recorded."""
+"""Values that leave a field open: merl chooses a value for this machine and records its choice."""
 REOPENED = ("threads", "agent.precision", "agent.torch_compile")
-"""Fields that another machine decides anew, if they were left open."""
+"""Fields that are chosen again on another machine if the user left them open."""
 _NAMES = ("run_dir", "preset", "setting")
-"""Fields that only say where the others are from."""
+"""Fields that only name the folder of the run or the source of other values."""
 
 
 def left_open(config: TrainConfig) -> tuple[str, ...]:
-    """Names of the fields that a config leaves for the machine to decide."""
+    """Return the names of the fields that a config leaves open."""
     values = dict(_flat(config))
     return tuple(name for name, value in _LEFT_OPEN.items() if values[name] == value)
 
 
 def reopened(config: TrainConfig, names: Iterable[str] = REOPENED) -> TrainConfig:
-    """A config with fields left open again."""
+    """Return a config in which the named fields are open again."""
     for name in names:
         config = _replaced(config, name, _LEFT_OPEN[name])
     return config
 
 
 def decided(config: TrainConfig) -> TrainConfig:
-    """A config that leaves nothing open, with any values."""
+    """Return a config in which device, threads, precision and compilation have fixed values.
+
+    The values are arbitrary.
+    """
     values = {
         "device": "cpu",
         "threads": 1,
@@ -74,18 +78,18 @@ def decided(config: TrainConfig) -> TrainConfig:
 def merge_resume_config(
     recorded: TrainConfig, asked: TrainConfig, given_open: Iterable[str] = ()
 ) -> tuple[TrainConfig, list[str]]:
-    """The config with which a run goes on.
+    """Return the config of a run that resumes.
 
     Args:
-        recorded: what it was trained with so far.
-        asked: what it is to be trained with; a field that is left open keeps its recorded value.
-        given_open: names of fields that are to be decided anew, since the user asks for that.
+        recorded: the config so far.
+        asked: the requested config; a field that it leaves open keeps its recorded value.
+        given_open: names of fields to choose again, because the user left them open explicitly.
 
     Returns:
-        The recorded config with the harmless changes, and these in words.
+        The recorded config with the allowed changes, and a list of these changes as text.
 
     Raises:
-        MerlError: what is asked for would be another run; it names the fields.
+        MerlError: a change is not allowed on resume; the message names the fields.
     """
     before, after = dict(_flat(recorded)), dict(_flat(asked))
     open_fields = left_open(asked)
@@ -94,28 +98,28 @@ def merge_resume_config(
         for name in {**before, **after}
         if before.get(name) != after.get(name)
         and name not in _NAMES
-        and not (recorded.own_env and name.startswith("env."))  # of merl's own tasks alone
-        and name != "minutes"  # those of the stretch that begins
+        and not (recorded.own_env and name.startswith("env."))  # only for merl's own tasks
+        and name != "minutes"  # counted since the resume
         and (name in given_open or name not in open_fields)
     }
-    in_words = {
-        name: f"{name} {_told(old)} -> {_told(new)}" for name, (old, new) in changed.items()
+    as_text = {
+        name: f"{name} {_format(old)} -> {_format(new)}" for name, (old, new) in changed.items()
     }
-    refused = [words for name, words in in_words.items() if name not in HARMLESS]
+    refused = [text for name, text in as_text.items() if name not in HARMLESS]
     if refused:
         raise MerlError(
-            f"run {recorded.run_dir} cannot go on with {', '.join(refused)}: that is another run; "
-            "leave it as it was, or begin one with another --run-dir"
+            f"run {recorded.run_dir} cannot resume with {', '.join(refused)}: keep the recorded "
+            "value, or start a new run with another --run-dir"
         )
     config = recorded
     for name in changed:
         config = _replaced(config, name, after[name])
     config = dataclasses.replace(config, minutes=asked.minutes)
-    return config, list(in_words.values())
+    return config, list(as_text.values())
 
 
 def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every field of a config and of the configs in it, by its dotted name."""
+    """Yield the dotted name and value of every field, including nested configs."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
@@ -131,5 +135,5 @@ def _replaced(config: Any, name: str, value: Any) -> Any:
     return dataclasses.replace(config, **{first: value})
 
 
-def _told(value: Any) -> str:
+def _format(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)

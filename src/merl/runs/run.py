@@ -1,11 +1,11 @@
-"""A run is a folder; everything after training works from that folder alone.
+"""A run is a folder; everything after training needs only this folder.
 
-config.json     what was run: the config, the spaces, versions, commit, machine
-metrics.csv     the numbers, a row per episode and evaluation (the truth)
-tensorboard/    the same numbers as events
-checkpoints/    what the run goes on from
-replay/         the memory-mapped ring
-videos/         an evaluation episode each
+config.json     config, spaces, versions, commit, machine
+metrics.csv     the metrics, one row per episode and evaluation (authoritative)
+tensorboard/    the same metrics as TensorBoard events
+checkpoints/    the checkpoints from which the run resumes
+replay/         the memory-mapped replay buffer
+videos/         one episode of each filmed evaluation
 curve.png       the learning curve, drawn when training ends
 """
 
@@ -50,18 +50,18 @@ from merl.runs.trust import Origin
 
 FORMAT = 1
 Bounds = tuple[list[float], list[float]]
-"""Of an environment's own actions: lower, upper."""
+"""Lower and upper bounds of the environment's actions before rescaling."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run's folder and the config that it was started with.
+    """A run: its folder and its config.
 
     Attributes:
         path: the folder.
-        config: with everything decided that the user left open.
-        left_open: names of the fields that the user left open, so that they are decided anew on
-            another machine (`resuming.REOPENED`).
+        config: the config, with a value for each field that the user left open.
+        left_open: names of the fields that the user left open; some of them are chosen again on
+            another machine (`merl.runs.resume.REOPENED`).
         created: this process has created the folder.
     """
 
@@ -82,19 +82,20 @@ class Run:
         *,
         home: Path | None = None,
     ) -> Iterator[Run]:
-        """Create the folder of a new run, lock it, and record what is run; unlock it at the end.
+        """Create the folder of a new run, lock it, and write its config; unlock it at the end.
 
         Args:
-            config: of the run.
-            observation_space: what the agent consumes.
-            action_space: what it does, in [-1, 1].
-            bounds: of the environment's own actions, where they were rescaled.
+            config: the config of the run.
+            observation_space: the observation keys that the agent uses.
+            action_space: the agent's actions, in [-1, 1].
+            bounds: the bounds of the environment's actions before rescaling; None if they are not
+                rescaled.
             left_open: names of the fields that the user left open.
             home: see `run_path`.
 
         Raises:
-            MerlError: the folder holds something, cannot be made, or another process begins a run
-                in it.
+            MerlError: the folder holds other files, cannot be created, or is in use by another
+                process.
         """
         path, created = create_folder(config, home)
         run = cls(path, config, left_open, created)
@@ -106,7 +107,7 @@ class Run:
                     if created:
                         path.rmdir()
                 raise
-            refuse_existing(path)  # by the process that had the lock before
+            refuse_existing(path)  # another process may have started a run before this lock
             try:
                 record = {
                     "format": FORMAT,
@@ -135,17 +136,19 @@ class Run:
 
     @classmethod
     def open(cls, path: Path) -> Run:
-        """Open a run that exists; nothing of it is imported or executed.
+        """Open an existing run without importing or executing any code of it.
 
         Raises:
-            MerlError: the folder is not a run's.
+            MerlError: the folder is not a run, or its config cannot be read.
         """
         path = path.absolute()  # user code may change the working folder
         with _readable(path):
             record = _read(path)
             number = record["format"]
             if number != FORMAT:
-                raise MerlError(f"it has format {number}, this merl reads {FORMAT}")
+                raise MerlError(
+                    f"it has format {number}, but this version of merl reads format {FORMAT}"
+                )
             observation_space, _ = _recorded_spaces(record)
             config = _read_config(_updated(record["config"], observation_space))
             if config.own_env and "user_env" not in record["config"]:
@@ -160,11 +163,12 @@ class Run:
         """Import the module of the run's environment, if the environment is the user's own.
 
         Args:
-            trusted: the user says that the module may be imported, as `origin` names it.
-            named_in: the folder in which the user named the task, where the module may lie, too.
+            trusted: the user allows the import of the module that `origin` describes.
+            named_in: a folder that may contain the module as well, because the user named the task
+                there; this also allows the import.
 
         Raises:
-            MerlError: nobody says that it may be imported (`trust.check`), or it cannot be.
+            MerlError: the import is not allowed (`trust.check`), or it fails.
         """
         if not imports_code(self.config.task):
             return
@@ -182,11 +186,11 @@ class Run:
             load_module(self.config.task, *(each for each in folders if each is not None))
 
     def origin(self) -> Origin | None:
-        """The code that the run names as its environment; None if it is merl's or Gymnasium's."""
+        """Return the origin of the environment's code; None for merl's and Gymnasium's own."""
         return trust.origin(_read(self.path)) if imports_code(self.config.task) else None
 
     def record_resumption(self, step: int) -> None:
-        """Note that the run goes on from `step`, with what; from now on its config is this one."""
+        """Record that the run resumes at `step`: its current config, versions and machine."""
         record = _read(self.path)
         record["config"] = to_plain(self.config)
         record["left_open"] = list(self.left_open)
@@ -207,10 +211,10 @@ class Run:
     def check_environment(
         self, observation_space: spaces.Dict, action_space: spaces.Box, bounds: Bounds | None
     ) -> None:
-        """That an environment is what the run was trained in; arguments as for `create`.
+        """Check that an environment has the spaces of the run; arguments as for `begin`.
 
         Raises:
-            MerlError: naming what differs.
+            MerlError: the spaces differ; the message names each difference.
         """
         record = _read(self.path)
         before = {f"observation {k!r}": told(s) for k, s in record["observation_space"].items()}
@@ -225,25 +229,26 @@ class Run:
                 "low {}, high {}".format(*each) for each in (own, bounds)
             )
         differs = [
-            f"{name} was {before.get(name, 'not there')} and is {now.get(name, 'not there')}"
+            f"{name} was {before.get(name, 'missing')} and is {now.get(name, 'missing')}"
             for name in before | now
             if before.get(name) != now.get(name)
         ]
         if differs:
             raise MerlError(
-                f"the environment is not what {self.path} was trained in: {'; '.join(differs)}: "
-                "make it as it was, or begin another run"
+                f"the environment has changed since {self.path} was trained: {'; '.join(differs)}: "
+                "restore the environment, or start a new run"
             )
 
     def has_moved(self) -> bool:
-        """Whether it was trained last on another machine than this one."""
+        """Return whether the run was last trained on another machine."""
         return _last_machine(_read(self.path)) != machine()
 
     def begin_again(self) -> bool:
-        """Clear the folder for a first step, if it was left before its first checkpoint.
+        """Clear the folder for a new start, if the run ended before it produced any data.
 
         Returns:
-            Whether it is so; what has saved, measured or remembered anything is left as it is.
+            Whether the folder was cleared. A run with a checkpoint, with metrics, or with steps in
+            its replay buffer is left unchanged.
         """
         if any(path.name.isdecimal() for path in self.checkpoints.glob("*")):
             return False
@@ -256,27 +261,27 @@ class Run:
         return True
 
     def check_there(self) -> None:
-        """Before anything is written, lest a folder that was taken away be made anew.
+        """Check before a write that the folder still exists, so that it is not created again.
 
         Raises:
-            MerlError: the folder is gone.
+            MerlError: the folder was removed or moved.
         """
         if not (self.path / CONFIG_FILE).exists():
             raise MerlError(
-                f"run folder {self.path} is gone, removed or moved while the run was trained in "
-                "it: the run stops, and writes nothing in its place"
+                f"run folder {self.path} is gone: it was removed or moved during training; the run "
+                "stops and does not create it again"
             )
 
     def discard(self) -> None:
-        """Remove what this process has written, before the first step of a new run."""
+        """Delete everything that this process has written, before the first step of a new run."""
         discard_folder(self.path, self.created)
 
     def lock(self) -> AbstractContextManager[None]:
-        """Keep every other process from training in this folder; see `lock_folder`."""
+        """Lock the folder so that no other process trains in it; see `lock_folder`."""
         return lock_folder(self.path)
 
     def _write(self, record: Mapping[str, Any]) -> None:
-        """Replace `config.json` whole."""
+        """Replace `config.json` atomically."""
         part = self.path / PART
         try:
             with part.open("w") as file:
@@ -285,40 +290,40 @@ class Run:
                 os.fsync(file.fileno())
             part.replace(self.path / CONFIG_FILE)
         except OSError as error:
-            raise MerlError(f"{self.path} cannot be written to: {error.strerror}") from None
+            raise MerlError(f"{self.path} is not writable: {error.strerror}") from None
 
     @property
     def checkpoints(self) -> Path:
-        """Where the checkpoints are."""
+        """Return the folder of the checkpoints."""
         return self.path / "checkpoints"
 
     @property
     def videos(self) -> Path:
-        """Where the videos are."""
+        """Return the folder of the videos."""
         return self.path / "videos"
 
     @property
     def replay(self) -> Path:
-        """Where the ring lies."""
+        """Return the folder of the replay buffer."""
         return self.path / "replay"
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
-        """What the agent consumes, and its actions, without building the environment."""
+        """Return the recorded observation and action space; no environment is made."""
         with _readable(self.path):
             return _recorded_spaces(_read(self.path))
 
 
 def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
-    """A run's config; that of its agent is of the kind that the agent's name says."""
+    """Restore the config of a run; the agent's name selects the class of the agent config."""
     name = plain.get("agent_name", "merl")
     check_choice("agent", name, tuple(AGENTS))
     return from_plain(TrainConfig, plain, agent=type(AGENTS[name]))
 
 
 def _updated(plain: Mapping[str, Any], space: spaces.Dict) -> Mapping[str, Any]:
-    """Rewrite a recorded config without fields and values that merl no longer has.
+    """Replace fields and values of a recorded config that merl no longer has.
 
-    The renderer of a run whose agent sees no image of merl's own tasks does not matter.
+    A removed renderer is replaced only if the agent uses no image of merl's own tasks.
 
     Raises:
         MerlError: the run depends on a value that no longer exists.
@@ -337,7 +342,10 @@ def _updated(plain: Mapping[str, Any], space: spaces.Dict) -> Mapping[str, Any]:
 
 
 def _naming_its_keys(config: TrainConfig, space: spaces.Dict) -> TrainConfig:
-    """Name the keys of a run by an earlier merl, which left `state` out unless it was named."""
+    """Add the observation keys to the config of a run of an earlier version.
+
+    That version did not use `state` unless the config named it.
+    """
     images, vectors = modalities(config.agent, space)
     agent = dataclasses.replace(config.agent, images=images, vectors=vectors)
     return dataclasses.replace(config, agent=agent)
@@ -350,7 +358,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """What is wrong with a run's config, in one line."""
+    """Convert an error inside the block into a one-line error about the run's config."""
     file = path / CONFIG_FILE
     try:
         yield
@@ -358,12 +366,12 @@ def _readable(path: Path) -> Iterator[None]:
         way = ""
         if holds_nothing(path):
             way = (
-                ", and nothing else: begin it with the line of before, "
+                " and no other files: start it with the original command, "
                 f"{program()} train ... --run-dir {shlex.quote(str(path))}"
             )
         raise MerlError(f"{path} is not a run: it has no {CONFIG_FILE}{way}") from None
     except UnicodeDecodeError:
-        raise MerlError(f"{file} cannot be read: it is no text") from None
+        raise MerlError(f"{file} cannot be read: it is not a text file") from None
     except KeyError as error:
         raise MerlError(f"{file} cannot be read: it has no {error}") from None
     except OSError as error:
@@ -382,7 +390,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _last_machine(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Where the run was trained last."""
+    """Return the machine on which the run was last trained."""
     recorded: dict[str, Any] = record.get("resumed", [record])[-1]["machine"]
     return recorded
 

@@ -1,4 +1,4 @@
-"""The folder of a run: its name, its lock, and what may lie in it before a run begins."""
+"""The folder of a run: name, lock, and checks before a run starts in it."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from merl.core import CONFIG_FILE, METRICS_FILE, MerlError
 
 LOCK_FILE = "lock"
 PART = f".{CONFIG_FILE}.part"
-"""`config.json` while it is written."""
+"""Temporary name of `config.json` while it is written."""
 _FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, PART, LOCK_FILE)
 _FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 
 
 def run_path(config: TrainConfig, home: Path | None = None) -> Path:
-    """Return the folder that a config names, or the first of the default ones that is free.
+    """Return the folder that a config names, or else the first unused default folder.
 
     Args:
-        config: of the run.
-        home: where a relative folder lies; the working folder if None.
+        config: the config of the run.
+        home: the base of a relative path; the working folder if None.
 
     Returns:
         An absolute path.
@@ -50,37 +50,40 @@ def resume_line(folder: Path) -> str:
 
 
 def refuse_existing(path: Path) -> None:
-    """Never write into a folder that holds something.
+    """Check that a new run can use a folder.
 
-    A folder that is empty, or that a run left which was killed at its very start, holds nothing.
+    The folder may be missing, empty, or left by a run that was killed before it wrote its config.
 
     Raises:
-        MerlError: the folder holds something, or its name is refused by the system.
+        MerlError: the folder holds other files, or the system does not allow its name.
     """
     if not _exists(path) or holds_nothing(path):
         return
     if _exists(path / CONFIG_FILE):
-        way = f"go on with `{resume_line(path)}`, or name another"
+        way = f"resume it with `{resume_line(path)}`, or name another"
     else:
         way = "it is not a run: name another"
-    raise MerlError(f"run folder {path} exists already: {way} with --run-dir")
+    raise MerlError(f"run folder {path} already exists: {way} with --run-dir")
 
 
 def holds_nothing(path: Path) -> bool:
-    """Whether nothing is there but what a run writes before its config."""
+    """Return whether a folder holds at most the files that a run writes before its config."""
     try:
         return path.is_dir() and all(
             entry.name in (LOCK_FILE, PART) and not entry.is_symlink() for entry in path.iterdir()
         )
-    except OSError:  # it may not be read
+    except OSError:  # the folder is not readable
         return False
 
 
 def create_folder(config: TrainConfig, home: Path | None) -> tuple[Path, bool]:
-    """The folder of a new run, and whether this process has created it.
+    """Create the folder of a new run.
+
+    Returns:
+        The folder, and whether this process has created it.
 
     Raises:
-        MerlError: it holds something, or cannot be made.
+        MerlError: the folder holds other files, or cannot be created.
     """
     while True:
         path = run_path(config, home)
@@ -92,7 +95,7 @@ def create_folder(config: TrainConfig, home: Path | None) -> tuple[Path, bool]:
                 continue  # another process has just taken this name
             return path, False
         except OSError as error:
-            raise MerlError(f"the run's folder {path} cannot be made: {error.strerror}") from None
+            raise MerlError(f"run folder {path} cannot be created: {error.strerror}") from None
         return path, True
 
 
@@ -101,16 +104,16 @@ def _exists(path: Path) -> bool:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):
         return False
-    except OSError as error:  # too long a name, a folder that may not be searched
+    except OSError as error:  # the name is too long, or a folder is not searchable
         raise MerlError(f"run folder {path} cannot be used: {error.strerror}") from None
     return True
 
 
 def check_links(run: Path) -> None:
-    """Refuse to write through links that lead out of the folder, where a stranger put them.
+    """Check that no link in a run leads out of its folder; an untrusted run may contain such links.
 
     Raises:
-        MerlError: naming the link.
+        MerlError: there is such a link; the message names it.
     """
     root = run.resolve()
     for folder, folders, files in os.walk(run):
@@ -118,8 +121,8 @@ def check_links(run: Path) -> None:
             path = Path(folder, name)
             if path.is_symlink() and not _lies_in(path, root):
                 raise MerlError(
-                    f"{path} is a link to {path.readlink()}, outside of the run, and is not "
-                    "written to: replace it by what it leads to"
+                    f"{path} is a link to {path.readlink()}, outside of the run, and merl does not "
+                    "write through it: replace the link by the file or folder that it points to"
                 )
 
 
@@ -131,11 +134,13 @@ def _lies_in(link: Path, root: Path) -> bool:
 
 
 def discard_folder(run: Path, created: bool) -> None:
-    """Remove what this process has written into the folder of a new run, whose lock it has.
+    """Delete the files that this process has written into the folder of a new run.
+
+    This process must hold the lock.
 
     Args:
         run: the folder.
-        created: this process has created the folder, too.
+        created: this process has created the folder, so the folder is deleted, too.
     """
     for name in (*_FOLDERS, *_FILES):
         path = run / name
@@ -145,16 +150,16 @@ def discard_folder(run: Path, created: bool) -> None:
             with suppress(OSError):
                 path.unlink(missing_ok=True)
     if created:
-        with suppress(OSError):  # somebody has put a file into it
+        with suppress(OSError):  # the folder holds files of others
             run.rmdir()
 
 
 @contextmanager
 def lock_folder(run: Path) -> Iterator[None]:
-    """Keep every other process from training in a folder; the lock dies with the process.
+    """Lock a folder so that no other process trains in it; the lock ends with the process.
 
     Raises:
-        MerlError: another process trains here.
+        MerlError: another process has the lock or has removed the folder, or it cannot be locked.
     """
     path = run / LOCK_FILE
     with ExitStack() as stack:
@@ -170,8 +175,8 @@ def lock_folder(run: Path) -> Iterator[None]:
         except OSError as error:
             raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
         if not same:
-            raise MerlError(f"run folder {run} was removed by another process just now: try again")
-        with suppress(OSError):  # a full disk; the lock holds without the number
+            raise MerlError(f"run folder {run} was just removed by another process: try again")
+        with suppress(OSError):  # a full disk; the lock is valid without the number
             file.truncate(0)
             os.write(file.fileno(), str(os.getpid()).encode())
         yield
@@ -184,7 +189,7 @@ def _text(path: Path) -> str:
 
 
 def program() -> str:
-    """What to type to call this program again: `merl` if the shell would find it."""
+    """Return the command that calls this program: `merl` if the shell finds it, else its path."""
     found, called = shutil.which("merl"), Path(sys.argv[0])
     if found or called.name != "merl":
         return "merl"

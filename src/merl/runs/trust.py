@@ -1,9 +1,10 @@
-"""Which runs this user has trained: their environments may be imported again.
+"""Records of the runs that this user has trained: only their environments may be imported.
 
-The folder of a run can come from anybody, and importing the environment that it names would run
-code. Unless the environment is merl's or Gymnasium's, it is imported only where a record outside of
-the folder says that this user trained the run: a file with the run's random id as its name, which
-holds the task and the folder of its module. What `config.json` says of them is not believed.
+A run folder can come from anyone, and importing the environment that it names would run code. An
+environment of merl or Gymnasium is always allowed. Any other environment is imported only if a
+record outside of the run folder shows that this user trained the run. The record is a file whose
+name is the random id of the run; it holds the task and the folder of its module. The task and
+folder in `config.json` are not trusted.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the environment of a run comes from.
+    """The origin of the environment of a run.
 
     Attributes:
         task: `module:function` or `module:Id-v0`, or the id of a Gymnasium environment.
-        folder: that the module lies in; None where it is installed.
+        folder: the folder of the module; None if the module is installed.
     """
 
     task: str
     folder: str | None
 
     def __str__(self) -> str:
-        """The code that would be run, with control characters escaped."""
+        """Describe the code that would be imported, with control characters escaped."""
         module, colon, name = self.task.partition(":")
         if not colon:
             return f"Gymnasium environment {self.task!r}"
@@ -47,15 +48,15 @@ class Origin:
 
 
 def identity(known: Any = None) -> str:
-    """The id of a run: what is known, if it is one, else a new random one."""
+    """Return `known` if it is a valid run id, else a new random id."""
     return known if _is_identity(known) else uuid.uuid4().hex
 
 
 def origin(record: Mapping[str, Any]) -> Origin:
-    """What a `config.json` says of the environment of its run.
+    """Read the origin of the environment from the record of a run (`config.json`).
 
     Raises:
-        TypeError: it is not of the form that merl writes.
+        TypeError: task or folder is not a string.
     """
     task, folder = record["config"]["task"], record.get("module_folder")
     if not isinstance(task, str) or not isinstance(folder, str | None):
@@ -64,54 +65,54 @@ def origin(record: Mapping[str, Any]) -> Origin:
 
 
 def remember(record: Mapping[str, Any]) -> None:
-    """Record that this user trains a run, if its environment is code that `check` asks about.
+    """Record that this user trains a run, if its environment imports code.
 
-    A record that cannot be written is a warning.
+    If the record cannot be written, log a warning.
 
     Args:
-        record: what `config.json` holds.
+        record: the content of the run's `config.json`.
     """
-    told, name = origin(record), record["id"]
-    if not imports_code(told.task):
+    stated, name = origin(record), record["id"]
+    if not imports_code(stated.task):
         return
     try:
         folder = _folder()
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         part = folder / f".{name}.{os.getpid()}.part"
-        part.write_text(json.dumps(asdict(told)))
+        part.write_text(json.dumps(asdict(stated)))
         part.replace(folder / name)
     except OSError as error:
         _LOG.warning(
-            "that you trained this run is not recorded (%s): to resume or evaluate it, "
+            "merl could not record that you trained this run (%s): to resume or evaluate it, "
             "--trust will be needed",
             error,
         )
 
 
 def check(run: Path, record: Mapping[str, Any]) -> Origin:
-    """The recorded origin of a run that this user has trained.
+    """Return the recorded origin of a run that this user has trained.
 
     Args:
-        run: the run's folder, for the message.
-        record: what its `config.json` holds.
+        run: the folder of the run, for the message.
+        record: the content of its `config.json`.
 
     Raises:
-        MerlError: there is no such record, or it is of another environment.
+        MerlError: this user has no record of the run, or the record names another environment.
     """
-    told = origin(record)
+    stated = origin(record)
     try:
         recorded = _recorded(record.get("id"))
     except OSError as error:
         reason = f"your records of runs cannot be read ({error})"
     else:
-        if recorded is not None and recorded.task == told.task:
+        if recorded is not None and recorded.task == stated.task:
             return recorded
         reason = "you have no record of training it here"
         if recorded is not None:
-            reason = f"it was trained here with {recorded}, and its config.json was changed since"
+            reason = f"you trained it with {recorded}, and its config.json was changed since then"
     raise MerlError(
-        f"{run} names code as its environment: {told}. It is not imported, for {reason}: read "
-        "that code, then add --trust (in Python: make_env(trust=True))"
+        f"{run} names code as its environment: {stated}. It is not imported, because {reason}: "
+        "read that code, then add --trust (in Python: make_env(trust=True))"
     )
 
 
@@ -120,13 +121,13 @@ def _is_identity(value: Any) -> bool:
 
 
 def _folder() -> Path:
-    """Where the records are.
+    """Return the folder of the records.
 
     Raises:
-        OSError: there is no home.
+        OSError: there is no home folder.
     """
     state = Path(os.environ.get("XDG_STATE_HOME", ""))
-    if not state.is_absolute():  # a relative one is to be ignored, says its specification
+    if not state.is_absolute():  # the XDG specification says to ignore a relative path
         with suppress(RuntimeError):
             state = Path("~/.local/state").expanduser()
     if not state.is_absolute():

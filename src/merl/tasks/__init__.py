@@ -1,11 +1,11 @@
-"""What is solved: each task is a dm_control composer task with named reward terms and success."""
+"""Manipulation tasks: dm_control composer tasks with named reward terms and a success test."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from merl.core import MerlError, suggest
-from merl.tasks.simulator import check_versions  # before the tasks: it guards their imports
+from merl.tasks.simulator import check_versions  # first: it loads MuJoCo without OpenGL
 
 # isort: split
 from merl.tasks.box import ABOVE, BoxTask, HandStart
@@ -29,10 +29,10 @@ __all__ = [
 ]
 
 BOX_TASKS: dict[str, type[BoxTask]] = {"move_box": MoveBox, "lift_box": LiftBox}
-"""The tasks with a box by name: those that can be occluded, and begin with the hand at the box."""
+"""Tasks with a box, by name. They can be occluded, and support every `HandStart`."""
 
 TASKS: dict[str, Callable[[], JacoTask]] = {"reach_duplo": ReachDuplo, **BOX_TASKS}
-"""Every task by its name."""
+"""All tasks, by name."""
 
 
 def make_task(
@@ -42,33 +42,35 @@ def make_task(
     starts: tuple[HandStart, ...] = ABOVE,
     reward: RewardForm = "paper",
 ) -> JacoTask:
-    """A task by its name.
+    """Make a task by its name.
 
     Args:
         name: a key of `TASKS`.
-        occluded: with a disc between camera and object.
-        starts: where the hand starts; of several, one is drawn in each episode.
-        reward: which reward, for the tasks with a target.
+        occluded: put a disc between the camera and the object.
+        starts: where the hand starts; with several, each episode draws one.
+        reward: form of the reward, for tasks with a target.
 
     Raises:
-        MerlError: there is no such task, or it has no such form.
+        MerlError: the task is unknown, or does not support one of the options.
     """
     if name not in TASKS:
         raise MerlError(f"task {name!r} is unknown: {suggest(name, TASKS)}")
     if name in BOX_TASKS:
         if occluded and starts != ABOVE:
             raise MerlError(
-                "under the disc the hand has no room at the box: occluded needs --start above"
+                "occluded needs --start above: the disc leaves no space for the hand at the box"
             )
         return BOX_TASKS[name](occluded=occluded, starts=starts, reward=reward)
     if occluded:
         raise MerlError(f"{name} has no occluded form: choose from {', '.join(BOX_TASKS)}")
     if starts != ABOVE:
         raise MerlError(
-            f"{name} is solved where the hand starts {starts[0]}: only {', '.join(BOX_TASKS)} can"
+            f"{name} has no start {' '.join(starts)!r}, only 'above': choose from "
+            f"{', '.join(BOX_TASKS)} for other starts"
         )
     if reward != "paper":
         raise MerlError(
-            f"{name} has no reward {reward!r}, only 'paper': {', '.join(BOX_TASKS)} have others"
+            f"{name} has no reward {reward!r}, only 'paper': choose from {', '.join(BOX_TASKS)} "
+            "for other rewards"
         )
     return TASKS[name]()

@@ -1,4 +1,4 @@
-"""What the tasks with a box share: the box, a disc that hides it, starts with the hand at it."""
+"""Shared parts of the tasks with a box: the box, the occluding disc, and starts at the box."""
 
 from __future__ import annotations
 
@@ -17,53 +17,54 @@ from merl.tasks.rewards import SUCCESS_DISTANCE, RewardForm
 from merl.tasks.simulator import quiet_inverse_kinematics
 
 BOX_HALF_SIZE = 0.025
-"""Half the length of an edge, m: also the height at which the box's centre rests."""
+"""Half of the edge length, m. The centre of a box on the floor is at the same height."""
 BOX_MASS = 0.1
-"""kg."""
+"""Mass of the box, kg."""
 DISC_CENTER = (0.0, -0.06)
-"""Middle of the disc, x and y, m: nearer to the camera than the middle of the workspace, so that
-from where the camera stands it hides most of what lies there (docs/tasks.md)."""
+"""Centre of the disc, x and y, m. It is closer to the camera than the centre of the workspace, so
+that the disc hides most of the objects there from the camera (docs/tasks.md)."""
 DISC_HEIGHT = (0.135, 0.150)
-"""Lower and upper face of the disc, m above the floor."""
+"""Heights of the lower and the upper face of the disc above the floor, m."""
 AROUND_BOX = Box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.02))
-"""Where the tool centre point starts around the box, from the box's centre, m."""
+"""Start region of the tool centre point for `around`, relative to the box's centre, m."""
 CLOSED_AROUND_BOX = (0.2, 0.6)
-"""By which share the fingers are closed there, at least and at most: they do not yet touch it."""
+"""Minimum and maximum closed fraction of the fingers for `around`; they do not touch the box."""
 ATTEMPTS = 20
-"""To draw a start around the box in which the hand does not touch it."""
+"""Number of attempts to draw an `around` start in which the hand does not touch the box."""
 CLOSING_VELOCITY = 1.0
-"""Of the fingers that close around the box before an episode begins, rad/s."""
+"""Velocity of the fingers that close around the box before an episode, rad/s."""
 CLOSING_STEPS = 20
-"""For so many control steps: enough from the widest start."""
+"""Number of control steps in which the fingers close; enough for the widest start."""
 HandStart = Literal["above", "around", "holding", "carrying"]
-"""Where the hand starts: above the workspace, open around the box, closed around it, or closed
-around it on its way to the target."""
+"""Where the hand starts: above the workspace, open around the box, closed around the box, or closed
+around the box on the way to the target."""
 ABOVE: tuple[HandStart, ...] = ("above",)
-"""dm_control's start, that of every `JacoTask`."""
+"""The start in dm_control, and the only one of a plain `JacoTask`."""
 _RED = (1.0, 0.0, 0.0, 1.0)
 _GREY = (0.5, 0.5, 0.5, 1.0)
 
 
 class BoxTask(JacoTask):
-    """A task with a red cube, which may be hidden, and at which the hand may start.
+    """A task with a red cube that can be occluded, and at which the hand can start.
 
-    The start `above` is that of `JacoTask`. In `around` the hand is then moved to the box, to a
-    place drawn from `AROUND_BOX` and with its fingers closed by a share of `CLOSED_AROUND_BOX`,
-    where it touches nothing; should none be found, which is rare, it stays where it was. In
-    `holding` the fingers have closed from there, and hold the box, which is on the floor. In
-    `carrying` they hold it anywhere on the straight way from there to its target, ends included.
+    The start `above` is the start of `JacoTask`. For `around`, the hand is then moved to the box:
+    to a position drawn from `AROUND_BOX`, with the fingers closed by a fraction drawn from
+    `CLOSED_AROUND_BOX`, where it touches nothing. If no such position is found, which is rare, the
+    hand stays above. For `holding`, the fingers then close around the box, which is on the floor.
+    For `carrying`, they hold the box at a random point on the straight line from its position to
+    its target, both ends included.
 
     Args:
-        occluded: put a disc between camera and box.
-        starts: where the hand starts; of several, one is drawn in each episode. Under the disc
-            there is no room for it at the box.
-        reward: which reward.
+        occluded: put a disc between the camera and the box.
+        starts: where the hand starts; with several, each episode draws one. The disc of `occluded`
+            leaves no space for the hand at the box.
+        reward: form of the reward.
 
     Attributes:
-        occluded, reward: as given.
-        place: where the box is to be brought, m.
-        place_over_disc: the same when `occluded`, m.
-        disc_radius: of the disc, m.
+        occluded, reward: the arguments.
+        place: target position of the box, m.
+        place_over_disc: target position of the box if `occluded`, m.
+        disc_radius: radius of the disc, m.
     """
 
     success_distance = SUCCESS_DISTANCE
@@ -83,23 +84,23 @@ class BoxTask(JacoTask):
         self.occluded, self.reward, self._starts = occluded, reward, starts
         if reward == "staged":
             self.term_names = (*self.term_names, "success")
-        self._furnish()
+        self._add_objects()
         if occluded:
             _add_disc(self._arena, self.disc_radius)
 
-    def _furnish(self) -> None:
-        """Add what else the scene has; nothing, unless a task says so."""
+    def _add_objects(self) -> None:
+        """Add further objects to the scene; the default adds none."""
 
     def distance(self, physics: mjcf.Physics) -> float:
-        """From the box to its target, m."""
+        """Return the distance from the box to its target, m."""
         return self.goal_distance(physics)
 
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
-        """As every task, then the hand to the box where it starts there."""
+        """Start as `JacoTask` does, then move the hand to the box if the start requires it."""
         super().initialize_episode(physics, random_state)
-        if self._starts == ABOVE:  # dm_control's draws, and no other
+        if self._starts == ABOVE:  # draw the same random numbers as dm_control
             return
         start = self._starts[random_state.randint(len(self._starts))]
         if start == "above":
@@ -119,7 +120,7 @@ class BoxTask(JacoTask):
     def _place_hand_around_box(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> bool:
-        """Bring the hand to where the box is; returns whether a place was found."""
+        """Move the hand to the box; return whether a position without contact was found."""
         joints = physics.bind([*self.arm.joints, *self.hand.joints])
         above, prop = np.array(joints.qpos), np.array(physics.bind(self._prop_frame).xpos)
         place_hand = initializers.ToolCenterPointInitializer(
@@ -145,7 +146,7 @@ class BoxTask(JacoTask):
         pose = np.array(box.qpos)
         for _ in range(CLOSING_STEPS * self.physics_steps_per_control_step):
             physics.step()
-            if box_is_fixed:  # or it would fall before they hold it
+            if box_is_fixed:  # else it falls before the fingers hold it
                 box.qpos, box.qvel = pose, 0.0
         physics.set_control(np.zeros(physics.model.nu))
 
@@ -159,11 +160,11 @@ class BoxTask(JacoTask):
 
 
 def _add_disc(arena: composer.Arena, radius: float) -> None:
-    """Fix a solid disc between the camera and the middle of the workspace.
+    """Add a fixed, solid disc between the camera and the centre of the workspace.
 
     Args:
         arena: the scene.
-        radius: m.
+        radius: radius of the disc, m.
     """
     lower, upper = DISC_HEIGHT
     arena.mjcf_model.worldbody.add(

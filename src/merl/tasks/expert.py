@@ -1,8 +1,8 @@
-"""Scripted experts: they read the simulator's state and solve every task.
+"""Scripted experts that read the simulator's state and solve every task.
 
-An expert for a box looks for a grasp that the arm can reach without touching anything, goes there,
-closes its fingers, carries the box, and in the end corrects for where it really is. When it loses
-the box it begins again.
+An expert for a box finds a grasp that the arm can reach without a collision, moves there, closes
+the fingers, carries the box, and finally corrects the error of the box's position. If it loses the
+box, it starts again.
 """
 
 from __future__ import annotations
@@ -20,52 +20,53 @@ from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
 
 Actions = Iterator[Array]
-"""Velocities, (9,), rad/s, for one step after another."""
+"""Joint velocities, (9,), rad/s, one array for each step."""
 
 CLOSED = 1.1
-"""About where a box stops the fingers, rad: they slow down towards it."""
+"""Angle at which a box stops the fingers, approximately, rad. They slow down towards it."""
 CLOSING_VELOCITY = 0.6
-"""At least this is asked of the fingers until they are stopped, rad/s."""
+"""Minimum velocity commanded to the closing fingers until they stop, rad/s."""
 STOPPED = 0.1
-"""A finger slower than this is stopped, rad/s."""
+"""A finger slower than this counts as stopped, rad/s."""
 GRIP = np.array([0.2, 0.1, 0.1])
-"""Velocities asked of the fingers while they hold, rad/s: the one presses as much as the two."""
+"""Velocities commanded to the fingers while they hold the box, rad/s. The first finger presses as
+hard as the other two together."""
 FINGER_GAIN = 8.0
-"""Of a finger towards an angle, 1/s."""
+"""Gain from the error of a finger's angle to its velocity, 1/s."""
 TRACKING_GAIN = 6.0
-"""Of a joint towards its path, 1/s."""
+"""Gain from the error of a joint on its path to its velocity, 1/s."""
 SERVO_GAIN = 4.0
-"""Of the hand towards a pose, 1/s."""
+"""Gain from the error of the hand's pose to its velocity, 1/s."""
 ARRIVED = 0.015
-"""A joint this near the end of its path is there, rad."""
+"""A joint this close to the end of its path has arrived, rad."""
 SETTLING_STEPS = 12
-"""At most so many to get there, after the path's time is over."""
+"""Maximum number of steps to arrive after the duration of the path."""
 CLOSING_STEPS = range(8, 30)
-"""So many, at least and at most, for the fingers to close."""
+"""Minimum and maximum number of steps for the fingers to close."""
 SLIP = 0.03
-"""A box that moved this far in the hand is lost, m."""
+"""A box that has moved further than this in the hand is lost, m."""
 BACK_OFF = 0.1
-"""How far the hand draws back from a box that it lost, m."""
+"""Distance by which the hand retreats from a lost box, m."""
 ABOVE = np.array([0.0, 0.0, 0.04])
-"""From where a box is set down, m above its place."""
+"""Offset above its target from which a box is set down, m."""
 ABOVE_BRICK = np.array([0.0, 0.0, 0.03])
-"""Where the hand stays, m above the brick's origin, which is on its lower face."""
+"""Offset of the hand from the brick's origin, which is on the brick's lower face, m."""
 OVER_PLACE = 0.015
-"""A box this near the vertical through its place can be set down, m."""
+"""A box this close to the vertical line through its target can be set down, m."""
 
 
 class BoxLostError(Exception):
-    """The box is not where the fingers should hold it."""
+    """The fingers do not hold the box, or no free path to it or with it is found."""
 
 
 class Expert:
-    """Solves a task from the simulator's state, without randomness.
+    """A deterministic policy that solves a task from the simulator's state.
 
-    Call `reset()` when an episode has begun, then `act()` before each of its steps.
+    Call `reset()` after the start of an episode, then `act()` before each of its steps.
 
     Args:
-        task: what is to be solved.
-        physics: its simulation, which is only read.
+        task: the task to solve.
+        physics: the simulation of the task; the expert only reads it.
     """
 
     def __init__(self, task: JacoTask, physics: mjcf.Physics) -> None:
@@ -76,11 +77,11 @@ class Expert:
         self._actions: Actions = iter(())
 
     def reset(self) -> None:
-        """An episode has begun."""
+        """Start a new plan, for a new episode."""
         self._actions = PLANS[type(self.task)](self)
 
     def act(self) -> Array:
-        """The velocities to ask of the joints now, (9,), rad/s."""
+        """Return the joint velocities for the next step, (9,), rad/s."""
         velocities: Array = np.clip(next(self._actions), self._low, self._high)
         return velocities
 
@@ -96,23 +97,23 @@ class Expert:
 
     @property
     def hand(self) -> Pose:
-        """Of the pinch site."""
+        """Pose of the pinch site."""
         return self.arm.pose(self.q)
 
     @property
     def box(self) -> Pose:
-        """Of the object."""
+        """Pose of the object."""
         task, physics = self.task, self.physics
         return Pose(task.prop_position(physics), task.prop_rotation(physics))
 
     def reach(self) -> Actions:
-        """Go to the object."""
+        """Move the hand to the object."""
         rotation = self.hand.rotation
         while True:
             yield self.towards(Pose(self.box.position + ABOVE_BRICK, rotation), np.zeros(3))
 
     def lift(self) -> Actions:
-        """Take hold of the box and hold it at its target."""
+        """Grasp the box and hold it at its target."""
         assert isinstance(self.task, LiftBox)
         assert self.task.target is not None
         tilts = [tilt for tilt in TILTS if np.cos(tilt) >= self.task.vertical_cosine]
@@ -124,7 +125,7 @@ class Expert:
                 yield from self._back_off()
 
     def move(self) -> Actions:
-        """Take hold of the box, set it down at its target, and stay there."""
+        """Grasp the box, set it down at its target, and keep holding it there."""
         assert self.task.target is not None
         while True:
             try:
@@ -134,7 +135,7 @@ class Expert:
                 yield from self._back_off()
 
     def _carry(self, goal: Array, tilts: Sequence[float], upright: bool) -> Actions:
-        """Grasp the box and bring its middle near (3,), m."""
+        """Grasp the box and bring its centre near `goal`, (3,), m."""
         self.arm.load(self.physics, OPEN)
         approach = find_approach(self.arm, self.q, self.box, goal, tilts, upright)
         if approach is None:
@@ -153,7 +154,7 @@ class Expert:
             yield velocities
 
     def _hold_at(self, place: Array, from_above: bool = False) -> Actions:
-        """Keep the box in the grip and its middle at (3,), m."""
+        """Keep the box in the grip, with its centre at `place`, (3,), m."""
         rotation, held = self.hand.rotation, self.hand.relative(self.box).position
         while True:
             hand, box = self.hand, self.box
@@ -165,14 +166,14 @@ class Expert:
             yield self.towards(Pose(hand.position + error, rotation), GRIP)
 
     def _back_off(self) -> Actions:
-        """Open the fingers and draw the hand back."""
+        """Open the fingers and retract the hand."""
         q = self.q
         back = self.arm.solve(q, self.hand.shifted(-BACK_OFF * self.hand.rotation[:, 2]))
         yield from self._follow([q], lambda: self._bend(OPEN))
         yield from self._follow([q, q if back is None else back], lambda: self._bend(OPEN))
 
     def _close(self, q: Array) -> Actions:
-        """Close the fingers until something stops them, with the arm at `q`."""
+        """Close the fingers until an object stops them, and keep the arm at `q`."""
         for step in range(CLOSING_STEPS.stop):
             velocities = np.array(self._fingers.qvel)
             if step in CLOSING_STEPS and np.abs(velocities).max() < STOPPED:
@@ -193,17 +194,17 @@ class Expert:
             yield self._limited(TRACKING_GAIN * error, fingers())
 
     def towards(self, pose: Pose, fingers: Array) -> Array:
-        """Velocities that bring the hand nearer to a pose."""
+        """Return velocities that move the hand towards a pose."""
         twist = self.hand.twist_to(pose)
         return self._limited(self.arm.turn(self.q, SERVO_GAIN * twist), fingers)
 
     def _limited(self, arm: Array, fingers: Array) -> Array:
-        """Velocities of arm and fingers; the arm's keep their direction within the limits."""
+        """Join velocities of arm and fingers; scale those of the arm down to their limits."""
         excess = np.abs(arm / self.arm.max_velocity).max()
         return np.concatenate([arm / max(1.0, excess), fingers])
 
     def _bend(self, angles: Array) -> Array:
-        """Velocities of the fingers towards angles."""
+        """Return velocities that move the fingers towards `angles`, (3,), rad."""
         return FINGER_GAIN * (angles - self.fingers)
 
 
@@ -212,4 +213,4 @@ PLANS: dict[type[JacoTask], Callable[[Expert], Actions]] = {
     MoveBox: Expert.move,
     LiftBox: Expert.lift,
 }
-"""What an expert does in which task."""
+"""The plan of the expert for each task."""

@@ -1,4 +1,4 @@
-"""How the arm can take hold of a box and bring it somewhere without touching anything else."""
+"""Plan grasps of a box, and paths that carry it to a goal without collisions."""
 
 from __future__ import annotations
 
@@ -10,47 +10,47 @@ import numpy as np
 from merl.tasks.kinematics import Array, Kinematics, Path, Pose
 
 OPEN = np.full(3, 0.45)
-"""Angles of the fingers around a box, rad."""
+"""Angles of the open fingers around a box, rad."""
 CLOSING = tuple(np.full(3, angle) for angle in (0.6, 0.7, 0.8, 0.9, 1.0))
-"""While and after they close, rad: their tips are lowest between 0.6 and 0.9."""
+"""Angles of the fingers during and after closing, rad; the tips are lowest between 0.6 and 0.9."""
 TILTS = tuple(np.radians([0, 20, 30, 40, 45, 50, 55, 60, 65, 70]))
-"""Of the hand against straight down, rad: the larger, the further it gets under something."""
+"""Angles of the hand from straight down, rad. A larger tilt reaches further under an obstacle."""
 GRIPS = ((0.0, 0.0), (0.0, 0.006), (0.006, 0.006), (0.006, 0.0))
-"""Where the fingers close: above the middle of the box, and back along the hand, m."""
+"""Offsets of the grip from the centre of the box: upwards, and back along the hand, m."""
 FINGERS_MIDDLE = -0.011
-"""Where a box lies between the fingers along the hand's y axis, m."""
+"""Position of the box between the fingers, along the hand's y axis, m."""
 STRAIGHT = 0.2
-"""How far the hand goes at most straight to a box, and straight back with it, m."""
+"""Maximum length of the straight approach to a box, and of the straight retreat with it, m."""
 STRAIGHT_STEPS = 2
-"""Of the approach at least, where there is room: `LINE_STEP` each."""
+"""Minimum number of straight steps in an approach, `LINE_STEP` each, if there is space."""
 TOP = 0.36
-"""Up to here the hand may rise on its way, m."""
+"""Maximum height to which the hand rises on a path, m."""
 UNREACHED = 10.0
-"""What it costs that the goal seems out of reach, s."""
+"""Cost of a grasp from which the goal seems out of reach, s."""
 TURNS = tuple(np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180]))
-"""About the vertical, by which the hand may turn while it carries, rad."""
+"""Angles by which the hand may turn about the vertical while it carries the box, rad."""
 OFF_CENTRE = 100.0
-"""What a metre off the middle of the box costs, s/m: the grip is less sure."""
+"""Cost per metre between the grip and the centre of the box, s/m: such a grip is less secure."""
 BRIDGES = 80
-"""Number of direct connections, the fastest first, that are checked for collisions."""
+"""Maximum number of direct connections, fastest first, that are checked for collisions."""
 DETOURS = 400
-"""Number of connections over one random pose that are checked where no direct one is free."""
+"""Number of connections over one random pose; they are checked if no direct one is free."""
 DETOUR_SPREAD = 0.5
-"""Standard deviation of that pose around the direct connection, rad."""
+"""Standard deviation of the random pose around the direct connection, rad."""
 TRIED = 2
-"""At least this many grasps, the most promising first, are planned before the fastest is taken."""
+"""Minimum number of grasps, lowest cost first, that are planned before the fastest is chosen."""
 FAST = 5.0
-"""As long as the fastest plan takes longer, the other grasps are planned too: an episode has 10 s
-and the box must be set down in it, s."""
+"""While the fastest plan takes longer than this, s, further grasps are planned: the box must be set
+down within an episode of 10 s."""
 
 
 def hand_rotation(azimuth: float, tilt: float, roll: float = 1.0) -> Array:
-    """Of a hand whose fingers open horizontally, (3, 3).
+    """Return the rotation of a hand whose fingers open horizontally, (3, 3).
 
     Args:
-        azimuth: of where the hand points, about the vertical, rad.
-        tilt: 0 points down, pi/2 horizontally.
-        roll: 1 or -1: which side the single finger is on.
+        azimuth: direction in which the hand points, about the vertical, rad.
+        tilt: angle from straight down, rad: 0 points down, pi/2 points horizontally.
+        roll: 1 or -1: the side of the single finger.
     """
     across, down = np.sin(tilt), np.cos(tilt)
     pointing = np.array([across * np.cos(azimuth), across * np.sin(azimuth), -down])
@@ -59,12 +59,12 @@ def hand_rotation(azimuth: float, tilt: float, roll: float = 1.0) -> Array:
 
 
 def azimuth_of(pose: Pose) -> float:
-    """What `hand_rotation` was given, rad, for a roll of 1."""
+    """Return the azimuth of a `hand_rotation` with a roll of 1, rad."""
     return float(np.arctan2(-pose.rotation[0, 0], pose.rotation[1, 0]))
 
 
 def turned(rotation: Array, angle: float) -> Array:
-    """A rotation (3, 3) turned further about the vertical, by rad."""
+    """Return a rotation (3, 3) after a further turn about the vertical by `angle`, rad."""
     sine, cosine = np.sin(angle), np.cos(angle)
     about: Array = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     return about @ rotation
@@ -73,23 +73,23 @@ def turned(rotation: Array, angle: float) -> Array:
 def find_approach(
     arm: Kinematics, q: Array, box: Pose, goal: Array, tilts: Sequence[float], upright: bool
 ) -> Path | None:
-    """A fast one of the paths to a grasp from which the box can be brought to its goal.
+    """Return a fast path to a grasp from which the box can be brought to its goal.
 
     Args:
-        arm: it sees the world with open fingers.
-        q: where the arm is.
-        box: where the box is.
-        goal: where its middle is to be brought, (3,), m.
-        tilts: that the hand may have, rad.
+        arm: the kinematic model, loaded with open fingers.
+        q: current angles of the arm's joints.
+        box: pose of the box.
+        goal: target of the box's centre, (3,), m.
+        tilts: allowed tilts of the hand, rad.
         upright: see `find_carry`.
 
     Returns:
-        From `q` to where the fingers have only to close; None if there is none.
+        A path from `q` to a pose in which only the fingers have to close; None if none is found.
     """
     starts = _rises(arm, [q], None)
     found: list[tuple[float, Path]] = []
-    for at in _reachable(arm, q, box, goal, tilts):
-        ends = _ways_off(arm, at, None, STRAIGHT_STEPS)
+    for at in _reachable_grasps(arm, q, box, goal, tilts):
+        ends = _retreats(arm, at, None, STRAIGHT_STEPS)
         approach = _connected(arm, starts, ends)
         if approach is None:
             continue
@@ -105,11 +105,11 @@ def _seconds(plan: tuple[float, Path]) -> float:
     return plan[0]
 
 
-def _reachable(
+def _reachable_grasps(
     arm: Kinematics, q: Array, box: Pose, goal: Array, tilts: Sequence[float]
 ) -> list[Array]:
-    """Where the arm is around the box and touches nothing, the most promising first."""
-    level = box.rotation[:, np.abs(box.rotation[2]).argmin()]  # normal to a face that stands
+    """Return joint angles of the arm at collision-free grasps of the box, lowest cost first."""
+    level = box.rotation[:, np.abs(box.rotation[2]).argmin()]  # normal of an upright face
     yaw = np.arctan2(level[1], level[0])
     costs, found = [], []
     for quarter, tilt, roll in product(range(4), tilts, (1.0, -1.0)):
@@ -129,7 +129,7 @@ def _reachable(
 
 
 def _can_close(arm: Kinematics, q: Array, box: Pose) -> bool:
-    """Whether the fingers can close around the box and touch nothing else."""
+    """Return whether the fingers can close around the box without touching anything else."""
     held, free = arm.pose(q).relative(box), True
     for fingers in CLOSING:
         arm.bend(fingers)
@@ -139,17 +139,18 @@ def _can_close(arm: Kinematics, q: Array, box: Pose) -> bool:
 
 
 def find_carry(arm: Kinematics, q: Array, held: Pose, goal: Array, upright: bool) -> Path | None:
-    """The fastest of some free paths that bring a held box to its goal.
+    """Return the fastest of several free paths that bring a held box to its goal.
 
     Args:
-        arm: it sees the world with the fingers around the box.
-        q: where the arm is.
-        held: the box's pose in the hand's frame.
-        goal: where the middle of the box is to be brought, (3,), m.
-        upright: the hand may straighten up, and the box then tilts; else the box stays level.
+        arm: the kinematic model, loaded with the fingers around the box.
+        q: current angles of the arm's joints.
+        held: pose of the box in the hand's frame.
+        goal: target of the box's centre, (3,), m.
+        upright: the hand may turn to point straight down, which tilts the box; otherwise the box
+            stays level.
 
     Returns:
-        From `q` on; None if there is none.
+        A path that starts at `q`; None if none is found.
     """
     rotation = arm.pose(q).rotation
     rotations = [turned(rotation, turn) for turn in TURNS]
@@ -159,7 +160,7 @@ def find_carry(arm: Kinematics, q: Array, held: Pose, goal: Array, upright: bool
     found = [arm.solve(q, Pose(goal - r @ held.position, r)) for r in rotations]
     free = [end for end in found if end is not None and arm.is_free([end], held)]
     ends = [rise for end in free for rise in _rises(arm, [end], held)]
-    starts = _ways_off(arm, q, held, 0)[1:]  # the box is lifted before it is carried
+    starts = _retreats(arm, q, held, 0)[1:]  # the box is lifted before it is carried
     return _connected(arm, starts, ends, held)
 
 
@@ -168,7 +169,7 @@ def _connected(
 ) -> Path | None:
     """Return the fastest free path along one of `starts`, over to one of `ends`, and back along it.
 
-    It goes over straight or, where that is not free, by way of one other pose of the arm.
+    The connection is direct or, if no direct one is free, leads over one other pose of the arm.
     """
     if not starts or not ends:
         return None
@@ -195,7 +196,7 @@ def _connected(
 def _joined(
     arm: Kinematics, start: Path, middle: Path, end: Path, held: Pose | None
 ) -> Path | None:
-    """Join a path, poses between, and another path backwards; None unless all of it is free."""
+    """Join a path, poses between, and a reversed path; return None unless all of it is free."""
     path = [*start, *middle, *end[::-1]]
     if not arm.is_free([start[-1], *middle, end[-1]], held, lifted=True):
         return None
@@ -203,10 +204,10 @@ def _joined(
     return path if arm.is_free(corners_rounded, held) else None
 
 
-def _ways_off(arm: Kinematics, q: Array, held: Pose | None, least: int) -> list[Path]:
-    """Return paths that go straight back from where the hand points, then straight up.
+def _retreats(arm: Kinematics, q: Array, held: Pose | None, least: int) -> list[Path]:
+    """Return paths that lead straight back along the hand's axis, then straight up.
 
-    They go back by `least` steps or more, or as far as there is room.
+    The straight part has `least` steps or more, or as many as there is space for.
     """
     line = arm.line(q, -STRAIGHT * arm.pose(q).rotation[:, 2], held)
     backs = [line[: i + 1] for i in range(min(least, len(line) - 1), len(line))]
@@ -214,7 +215,7 @@ def _ways_off(arm: Kinematics, q: Array, held: Pose | None, least: int) -> list[
 
 
 def _rises(arm: Kinematics, path: Path, held: Pose | None) -> list[Path]:
-    """A path, and then straight up by each number of steps."""
+    """Return extensions of a path, straight up by every possible number of steps."""
     height = max(0.0, TOP - arm.pose(path[-1]).position[2])
     up = arm.line(path[-1], np.array([0.0, 0.0, height]), held)
     return [[*path, *up[1:i]] for i in range(1, len(up) + 1)]

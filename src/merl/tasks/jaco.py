@@ -1,7 +1,7 @@
-"""The scene that the tasks share: a Jaco arm with a three-fingered hand over a floor, and a camera.
+"""Scene of all tasks: a Jaco arm with a three-fingered hand above a floor, and a camera.
 
-Built from dm_control's entities, with the constants of its `manipulation` package. Lengths are in
-metres, times in seconds, angles in radians. The origin is on the floor under the middle of the
+It uses dm_control's entities and the constants of its `manipulation` package. Lengths are in
+metres, times in seconds, angles in radians. The origin is on the floor under the centre of the
 workspace, z points up, and the camera looks along +y at the arm, which stands behind the origin.
 """
 
@@ -23,16 +23,16 @@ from merl.tasks.simulator import quiet_inverse_kinematics
 CONTROL_TIMESTEP = 0.04
 """Time between two actions, s (dm_control `manipulation.shared.constants`)."""
 EPISODE_STEPS = 250
-"""Actions in an episode: 10 s (dm_control `manipulation`)."""
+"""Actions per episode: 10 s (dm_control `manipulation`)."""
 ARM_OFFSET = (0.0, 0.4, 0.0)
-"""Where the base of the arm stands, m (dm_control `manipulation.shared.robots`)."""
+"""Position of the base of the arm, m (dm_control `manipulation.shared.robots`)."""
 CAMERA = cameras.FRONT_CLOSE
 """The fixed camera in front of the arm: its name, position (m) and axes (dm_control)."""
 
 ProprioSet = Literal["paper", "full"]
 StateSet = Literal["absolute", "relative"]
 PROPRIO_SIZES: dict[ProprioSet, int] = {"paper": 24, "full": 42}
-"""How many numbers each set of proprioception has; see `JacoTask.proprio`."""
+"""Number of values in each set of proprioception; see `JacoTask.proprio`."""
 _POSE_AND_VELOCITY = ("position", "orientation", "linear_velocity", "angular_velocity")
 
 Float32 = NDArray[np.float32]
@@ -44,36 +44,36 @@ class Box(NamedTuple):
     """An axis-aligned box from which a position is drawn uniformly."""
 
     lower: Position
-    """Least x, y, z, m."""
+    """Minimum x, y, z, m."""
     upper: Position
-    """Greatest x, y, z, m."""
+    """Maximum x, y, z, m."""
 
 
 HAND_SPAWN = Box((-0.1, -0.1, 0.2), (0.1, 0.1, 0.4))
-"""Where the tool centre point starts (dm_control `manipulation.reach`)."""
+"""Start region of the tool centre point (dm_control `manipulation.reach`)."""
 OBJECT_SPAWN = Box((-0.1, -0.1, 0.001), (0.1, 0.1, 0.001))
-"""Where the lower face of the object is let go, 1 mm above the floor, before it settles (the same,
-whose objects have their origin there)."""
+"""Start region of the object's lower face, 1 mm above the floor; the object then falls and settles
+(dm_control `manipulation.reach`, where the origin of an object is on its lower face)."""
 
 
 class JacoTask(composer.Task):  # type: ignore[misc]
-    """An arm, a hand and one free object; a task adds what it rewards.
+    """A task with an arm, a hand and one free object; subclasses define the reward.
 
-    In every episode the hand starts at random in `HAND_SPAWN`, pointing down with its fingers
-    closed by a random amount, and the object lies at random in `OBJECT_SPAWN`.
+    In every episode the hand starts at a random position in `HAND_SPAWN`, points down, and has its
+    fingers closed by a random amount. The object starts at a random position in `OBJECT_SPAWN`.
 
     Args:
         prop: the object.
-        prop_height: of its origin above its lower face, m.
-        target: where the object is to be brought, m; None where the object itself is the target.
+        prop_height: height of the object's origin above its lower face, m.
+        target: target position of the object, m; None if the object itself is the target.
 
     Attributes:
         arm: the Jaco arm, six velocity-controlled joints.
         hand: the Jaco hand, three velocity-controlled fingers.
         prop: the object.
-        target: where the object is to be brought, (3,), m, or None.
-        term_names: the names of the reward's terms.
-        success_distance: the task is solved when `distance` is at most this, m.
+        target: target position of the object, (3,), m, or None.
+        term_names: names of the reward's terms.
+        success_distance: the task is solved if `distance` is at most this, m.
     """
 
     term_names: tuple[str, ...]
@@ -108,11 +108,11 @@ class JacoTask(composer.Task):  # type: ignore[misc]
 
     @property
     def root_entity(self) -> composer.Entity:
-        """The arena, which everything is attached to."""
+        """The arena, to which all other entities are attached."""
         return self._arena
 
     def compile(self) -> mjcf.Physics:
-        """The task's simulation; one serves all episodes, see `start_episode`."""
+        """Return the compiled simulation, which serves all episodes (see `start_episode`)."""
         random_state = np.random.RandomState(0)
         self._vary_model(random_state)
         physics = mjcf.Physics.from_mjcf_model(self._arena.mjcf_model)
@@ -120,10 +120,10 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         return physics
 
     def start_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Start an episode as `composer.Environment` does, without compiling the model again.
+        """Start an episode as `composer.Environment` does, but without recompiling the model.
 
-        Nothing in the model varies between episodes: the brick draws the size of its studs from a
-        range without width. The draw is made all the same, so that the starts are dm_control's.
+        The model does not vary between episodes: the brick draws the size of its studs from a range
+        of zero width. This method still makes that draw, so that the starts equal dm_control's.
         """
         self._vary_model(random_state)
         with physics.reset_context():
@@ -134,7 +134,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
             entity.initialize_episode_mjcf(random_state)
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Note where in MuJoCo's arrays the numbers lie that every step reads."""
+        """Store the indices of the values in MuJoCo's arrays that every step reads."""
         del random_state
         arm, fingers = physics.bind(self.arm.joints), physics.bind(self.hand.joints)
         self._arm_qpos, self._arm_qvel = _addresses(physics, arm.element_id)
@@ -150,45 +150,45 @@ class JacoTask(composer.Task):  # type: ignore[misc]
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
-        """Draw where fingers, hand and object start, in dm_control's order."""
+        """Draw the start of fingers, hand and object, in dm_control's order."""
         self.hand.set_grasp(physics, close_factors=random_state.uniform())
         with quiet_inverse_kinematics():
             self._place_hand(physics, random_state)
         self._place_prop(physics, random_state)
 
     def tool_center_point(self, physics: mjcf.Physics) -> NDArray[np.float64]:
-        """Where the fingers meet, (3,), m."""
+        """Return the point where the fingers meet, (3,), m."""
         return np.array(physics.data.site_xpos[self._tcp])
 
     def prop_position(self, physics: mjcf.Physics) -> NDArray[np.float64]:
-        """Origin of the object's frame, (3,), m."""
+        """Return the origin of the object's frame, (3,), m."""
         return np.array(physics.data.xpos[self._prop_body])
 
     def prop_rotation(self, physics: mjcf.Physics) -> NDArray[np.float64]:
-        """Axes of the object's frame, (3, 3), as columns."""
+        """Return the axes of the object's frame as columns, (3, 3)."""
         return np.array(physics.data.xmat[self._prop_body]).reshape(3, 3)
 
     def hand_distance(self, physics: mjcf.Physics) -> float:
-        """From the tool centre point to the object, m."""
+        """Return the distance from the tool centre point to the object, m."""
         offset = self.tool_center_point(physics) - self.prop_position(physics)
         return float(np.linalg.norm(offset))
 
     def goal_distance(self, physics: mjcf.Physics) -> float:
-        """From the object to its target, m; only where there is one."""
+        """Return the distance from the object to its target, m; the task must have a target."""
         assert self.target is not None
         return float(np.linalg.norm(self.prop_position(physics) - self.target))
 
     def tilt_cosine(self, physics: mjcf.Physics) -> float:
-        """How much the hand points down, in [-1, 1]: 1 is straight down.
+        """Return the cosine between the hand's axis and straight down, in [-1, 1].
 
-        The hand's axis leads from the centre of its largest part to the tool centre point; it is
-        0.9927 where an episode starts.
+        The hand's axis leads from the centre of the hand's largest part to the tool centre point.
+        The cosine is 0.9927 at the start of an episode.
         """
         axis = self.tool_center_point(physics) - physics.data.geom_xpos[self._wrist]
         return float(-axis[2] / np.linalg.norm(axis))
 
     def proprio(self, physics: mjcf.Physics, which: ProprioSet = "paper") -> Float32:
-        """What the robot feels of itself.
+        """Return the proprioception.
 
         Args:
             physics: the simulation.
@@ -198,7 +198,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
                 N m, and the pinch site's position in m (3) and rotation matrix (9).
 
         Returns:
-            float32 (24,) or (42,), as dm_control's observables give them.
+            float32 (24,) or (42,), with the values of dm_control's observables.
         """
         data = physics.data
         angles = data.qpos[self._arm_qpos]
@@ -219,15 +219,15 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         return np.concatenate(parts, dtype=np.float32, casting="same_kind")
 
     def state(self, physics: mjcf.Physics, which: StateSet = "absolute") -> Float32:
-        """All that matters, for agents without a camera.
+        """Return the full state of the task, for agents without a camera.
 
         Args:
             physics: the simulation.
             which: `absolute`: `full` proprioception (42), the object's position in m (3),
-                orientation as a unit quaternion (4), and linear and angular velocity in m/s and
-                rad/s (6), and where there is one the target's position in m (3). `relative`: also
-                the way from the tool centre point to the object (3), and from the object to the
-                target where there is one (3), in m.
+                orientation as a unit quaternion (4), linear and angular velocity in m/s and rad/s
+                (6), and the target's position in m (3) if there is a target. `relative`: also the
+                vectors from the tool centre point to the object (3) and, if there is a target, from
+                the object to the target (3), in m.
 
         Returns:
             float32, (55,) and (58,) without a target, (58,) and (64,) with one.
@@ -244,29 +244,29 @@ class JacoTask(composer.Task):  # type: ignore[misc]
 
     @abstractmethod
     def distance(self, physics: mjcf.Physics) -> float:
-        """How far the task is from being solved, m."""
+        """Return the distance that decides success, m."""
 
     def success(self, physics: mjcf.Physics) -> bool:
-        """Whether the task is solved at this moment."""
+        """Return whether the task is solved in the current state."""
         return self.distance(physics) <= self.success_distance
 
     @abstractmethod
     def reward_terms(self, physics: mjcf.Physics) -> dict[str, float]:
-        """The reward's terms by name; their sum is the reward, in [0, 1]."""
+        """Return the terms of the reward by name; their sum is the reward, in [0, 1]."""
 
     def get_reward(self, physics: mjcf.Physics) -> float:
-        """The sum of `reward_terms`, in [0, 1]."""
+        """Return the sum of `reward_terms`, in [0, 1]."""
         return sum(self.reward_terms(physics).values())
 
 
 def _addresses(physics: mjcf.Physics, joints: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Where the positions and the velocities of hinge joints lie in qpos and qvel."""
+    """Return the indices of hinge joints in qpos (positions) and in qvel (velocities)."""
     model = physics.model
     return model.jnt_qposadr[joints].copy(), model.jnt_dofadr[joints].copy()
 
 
 def _sensor_slice(physics: mjcf.Physics, sensors: list[Any]) -> NDArray[Any]:
-    """Where the readings of sensors lie in sensordata, one after another."""
+    """Return the indices of the sensors' readings in sensordata, concatenated."""
     ids = physics.bind(sensors).element_id
     starts, sizes = physics.model.sensor_adr[ids], physics.model.sensor_dim[ids]
     return np.concatenate([np.arange(a, a + n) for a, n in zip(starts, sizes, strict=True)])

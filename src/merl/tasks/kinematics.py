@@ -1,8 +1,8 @@
-"""The arm on paper: inverse kinematics, collisions and timing, on a copy of the simulation.
+"""Kinematic model of the arm: inverse kinematics, collisions and timing.
 
-Lengths are in metres, angles in radians, times in seconds. `q` is the angles of the six arm joints,
-(6,). The hand's pose is that of its pinch site: z is where the hand points, x the axis along which
-the fingers open.
+The model uses a copy of the simulation. Lengths are in metres, angles in radians, times in seconds.
+`q` stands for the angles of the six arm joints, (6,). The pose of the hand is the pose of its pinch
+site: z is the direction in which the hand points, x the axis along which the fingers open.
 """
 
 from __future__ import annotations
@@ -19,40 +19,42 @@ from merl.tasks.jaco import CONTROL_TIMESTEP, JacoTask
 
 Array = NDArray[np.float64]
 Path = list[Array]
-"""q after q, with straight lines between them."""
+"""A sequence of joint angles `q`, connected by straight lines in joint space."""
 
 CLEARANCE = 0.004
-"""What is nearer than this touches, m: the arm strays a little from its plan."""
+"""Geoms closer than this count as touching, m: the arm deviates a little from its plan."""
 SCENE_CLEARANCE = 0.006
-"""The robot's distance from what is fixed, the floor excepted, m."""
+"""Minimum distance between the robot and fixed geoms other than the floor, m."""
 HELD_CLEARANCE = 0.015
-"""The same for a held object, which moves in the grip and lags behind with the hand, m."""
+"""Minimum distance between a held object and fixed geoms other than the floor, m: the object moves
+in the grip, and lags behind the plan together with the hand."""
 SUNK = 5e-4
-"""The resting object sinks into the floor by less than this, m."""
+"""A resting object sinks into the floor by less than this, m."""
 FLOOR_CLEARANCE = 1e-3
-"""The robot keeps this distance from the floor, m: a finger that scrapes over it does not close."""
+"""Minimum distance between the robot and the floor, m: a finger that scrapes the floor does not
+close."""
 DAMPING = 0.02
-"""Of the least squares, m: bounds the step near singular poses."""
+"""Damping of the least squares, m; it bounds the step near singular poses."""
 LEVER = 0.15
-"""What a radian of orientation weighs against position, m."""
+"""Weight of one radian of orientation error, as metres of position error."""
 MAX_TURN = 0.5
-"""The most that a joint turns in one iteration, rad."""
+"""Maximum turn of a joint in one iteration, rad."""
 ITERATIONS = 25
-"""A pose that is not reached after so many is out of reach."""
+"""Maximum number of iterations; a pose that is not reached by then is out of reach."""
 TOLERANCE = 1e-3
-"""How near to a pose is there, m, and rad times `LEVER`."""
+"""Maximum error of a reached pose: position in m, orientation in rad times `LEVER`."""
 LINE_STEP = 0.04
-"""Between two poses of a straight line of the hand, m."""
+"""Distance between two poses on a straight line of the hand, m."""
 CHECK_STEP = 0.1
-"""The most that a joint turns between two looks for collisions, rad."""
+"""Maximum turn of a joint between two collision checks, rad."""
 SPEED = 0.95
-"""Of the fastest joint along a path, as a share of its greatest velocity."""
+"""Velocity of the fastest joint along a path, as a fraction of its maximum velocity."""
 SMOOTHING = 9
-"""Steps over which a reference is averaged: the wrist takes eight to reach its velocity."""
+"""Steps over which a reference is averaged: the wrist needs eight to reach its velocity."""
 
 
 class Pose(NamedTuple):
-    """Of the hand or of the object."""
+    """Pose of the hand or of the object."""
 
     position: Array
     """(3,), m."""
@@ -60,21 +62,21 @@ class Pose(NamedTuple):
     """(3, 3), its axes as columns."""
 
     def of(self, other: Pose) -> Pose:
-        """The pose in the world of what has the pose `other` in this one's frame."""
+        """Return the world pose of a body whose pose in this frame is `other`."""
         return Pose(self.position + self.rotation @ other.position, self.rotation @ other.rotation)
 
     def relative(self, other: Pose) -> Pose:
-        """The pose in this one's frame of what has the pose `other` in the world."""
+        """Return the pose in this frame of a body whose world pose is `other`."""
         return Pose(
             self.rotation.T @ (other.position - self.position), self.rotation.T @ other.rotation
         )
 
     def shifted(self, offset: Array) -> Pose:
-        """The pose moved by (3,), m, of the world's axes."""
+        """Return the pose moved by `offset`, (3,), m, along the world's axes."""
         return Pose(self.position + offset, self.rotation)
 
     def twist_to(self, other: Pose) -> Array:
-        """What leads to another pose: (6,), translation, m, and rotation vector, rad."""
+        """Return the motion to another pose: (6,), translation in m, rotation vector in rad."""
         quaternion, rotation = np.zeros(4), np.zeros(3)
         mujoco.mju_mat2Quat(quaternion, (other.rotation @ self.rotation.T).ravel())
         mujoco.mju_quat2Vel(rotation, quaternion, 1.0)
@@ -82,14 +84,14 @@ class Pose(NamedTuple):
 
 
 class Kinematics:
-    """Where a task's arm can go; the simulation itself is only read.
+    """Kinematic model of a task's arm; it only reads the simulation.
 
     Args:
-        task: whose arm it is.
-        physics: its simulation.
+        task: the task that has the arm.
+        physics: the simulation of the task.
 
     Attributes:
-        max_velocity: of the arm's joints, (6,), rad/s.
+        max_velocity: maximum velocities of the arm's joints, (6,), rad/s.
     """
 
     def __init__(self, task: JacoTask, physics: mjcf.Physics) -> None:
@@ -101,8 +103,8 @@ class Kinematics:
         fingers = physics.bind(task.hand.joints).element_id
         self._qpos, self._dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._finger_qpos = model.jnt_qposadr[fingers]
-        self._prop_qpos = slice(model.nq - 7, None)  # its free joint is the last
-        self._resting: Array = model.qpos0[self._prop_qpos].copy()  # the object's, see `load`
+        self._prop_qpos = slice(model.nq - 7, None)  # the object's free joint is the last
+        self._resting: Array = model.qpos0[self._prop_qpos].copy()  # pose of the object, see `load`
         self._site = int(physics.bind(task.hand.tool_center_point).element_id)
         self._turns_freely = ~model.jnt_limited[joints].astype(bool)
         unlimited = [[-np.inf], [np.inf]]
@@ -115,37 +117,37 @@ class Kinematics:
         self._is_prop[physics.bind(task.prop.mjcf_model.find_all("geom")).element_id] = True
 
     def load(self, physics: mjcf.Physics, fingers: Array) -> None:
-        """See the world as it is, but for the fingers' angles, (3,), rad."""
+        """Copy the state of the simulation, but with other finger angles, (3,), rad."""
         self._data.qpos[:] = physics.data.qpos
         self.bend(fingers)
         self._resting = self._data.qpos[self._prop_qpos].copy()
 
     def bend(self, fingers: Array) -> None:
-        """See the fingers at other angles, (3,), rad."""
+        """Set the angles of the fingers in the copy, (3,), rad."""
         self._data.qpos[self._finger_qpos] = fingers
 
     def pose(self, q: Array) -> Pose:
-        """Of the hand."""
+        """Return the pose of the hand at joint angles `q`."""
         self._data.qpos[self._qpos] = q
         mujoco.mj_kinematics(self._model, self._data)
         rotation = self._data.site_xmat[self._site].reshape(3, 3)
         return Pose(self._data.site_xpos[self._site].copy(), rotation.copy())
 
     def turn(self, q: Array, twist: Array) -> Array:
-        """How the joints turn to move the hand a little, by damped least squares.
+        """Return the turn of the joints that moves the hand a little, by damped least squares.
 
         Args:
-            q: where they are.
-            twist: of the hand, (6,), m and rad; or a velocity, m/s and rad/s.
+            q: current angles of the joints.
+            twist: motion of the hand, (6,), in m and rad; or its velocity, in m/s and rad/s.
 
         Returns:
-            (6,), rad; or rad/s.
+            The turn of the joints, (6,), in rad; or their velocity, in rad/s.
         """
         self.pose(q)
         return self._turn(twist * (1.0, 1.0, 1.0, LEVER, LEVER, LEVER))
 
     def _turn(self, twist: Array) -> Array:
-        """The same from where the copy is, with orientation times `LEVER`."""
+        """Turn from the pose of the copy; the orientation in `twist` is already times `LEVER`."""
         mujoco.mj_comPos(self._model, self._data)
         jacobian = np.zeros((6, self._model.nv))
         mujoco.mj_jacSite(self._model, self._data, jacobian[:3], jacobian[3:], self._site)
@@ -156,7 +158,7 @@ class Kinematics:
         return result
 
     def solve(self, q: Array, pose: Pose) -> Array | None:
-        """The q for a pose of the hand, near the given one; None where it is out of reach."""
+        """Return the q near the given one for a pose of the hand; None if it is out of reach."""
         start = q
         for _ in range(ITERATIONS):
             error = self.pose(q).twist_to(pose)
@@ -175,15 +177,15 @@ class Kinematics:
         return limited
 
     def line(self, q: Array, offset: Array, held: Pose | None = None) -> Path:
-        """Move the hand straight by (3,), m, without turning it, as far as it can and is free.
+        """Move the hand along a straight line without turning it, until the way is blocked.
 
         Args:
-            q: where the arm is.
-            offset: by which the hand is to move.
+            q: current angles of the joints.
+            offset: motion of the hand, (3,), m.
             held: see `is_free`.
 
         Returns:
-            From `q` on, a q for every `LINE_STEP`.
+            A path that starts at `q`, with one q for every `LINE_STEP` that is reachable and free.
         """
         start, path = self.pose(q), [q]
         length = float(np.linalg.norm(offset))
@@ -195,13 +197,13 @@ class Kinematics:
         return path
 
     def is_free(self, path: Path, held: Pose | None = None, *, lifted: bool = False) -> bool:
-        """Return whether the arm touches nothing along a path, its start excepted.
+        """Return whether the arm touches nothing along a path, except at its start.
 
         Args:
-            path: at least one q; a single q is checked itself.
-            held: pose of a held object in the hand's frame: it moves with the hand and may touch
-                it. None: the object stays where it is.
-            lifted: the held object must also keep its distance from the floor.
+            path: at least one q; a single q is itself checked.
+            held: pose of a held object in the hand's frame; the object moves with the hand and may
+                touch it. None: the object stays in its place.
+            lifted: a held object must also keep its distance from the floor.
         """
         for a, b in zip(path, path[1:] or path, strict=False):
             count = max(int(np.ceil(np.abs(b - a).max() / CHECK_STEP)), 1)
@@ -231,16 +233,16 @@ class Kinematics:
         return bool((close & (robot if held is None else robot != moved)).any())
 
     def seconds(self, path: Path) -> float:
-        """How long a path takes at full speed."""
+        """Return the duration of a path at full speed, s."""
         return float(self.durations(np.diff(np.array(path), axis=0)).sum())
 
     def durations(self, turns: Array) -> Array:
-        """How long turns of the joints take at full speed, s: (..., 6), rad, to (...)."""
+        """Return the durations (...), s, of turns of the joints (..., 6), rad, at full speed."""
         durations: Array = (np.abs(turns) / (SPEED * self.max_velocity)).max(axis=-1)
         return durations
 
     def timed(self, path: Path) -> Array:
-        """Where the joints should be after each step along a path, (steps, 6), corners rounded."""
+        """Return the target angles after each step of a path, (steps, 6), rad, corners rounded."""
         times = np.concatenate([[0.0], np.cumsum(self.durations(np.diff(path, axis=0)))])
         at = np.arange(0.0, times[-1] + CONTROL_TIMESTEP, CONTROL_TIMESTEP)
         joints = [np.interp(at, times, angles) for angles in np.array(path).T]

@@ -8,17 +8,17 @@ from merl.tasks import rewards
 from merl.tasks.box import BoxTask
 
 TARGET = (0.0, 0.0, 0.18)
-"""Where the centre of the box is to be, m. It is not marked."""
+"""Target of the box's centre, m. No mark shows it."""
 TARGET_OVER_DISC = (0.0, 0.0, 0.22)
-"""The same when `occluded`, m: at 0.18 the box would rest on the disc."""
+"""Target of the box's centre if `occluded`, m: at 0.18 the box would rest on the disc."""
 DISC_RADIUS = 0.075
-"""Of the disc that hides the box when `occluded`, m."""
+"""Radius of the disc that hides the box if `occluded`, m."""
 VERTICAL_COSINE_AROUND_DISC = 0.40
-"""Bound and margin of the vertical term when `occluded`: the hand has to tilt to get under."""
+"""Bound and margin of the vertical term if `occluded`: the hand tilts to reach under the disc."""
 
 
 class LiftBox(BoxTask):
-    """Bring a cube to within 1 cm of a place in the air (MERL B.1, Eq. 5)."""
+    """Bring a cube to within 1 cm of a target in the air (MERL B.1, Eq. 5)."""
 
     term_names = ("reaching", "vertical", "floating", "lifting")
     place, place_over_disc = TARGET, TARGET_OVER_DISC
@@ -26,11 +26,11 @@ class LiftBox(BoxTask):
 
     @property
     def vertical_cosine(self) -> float:
-        """From this `tilt_cosine` on the hand counts as vertical."""
+        """Minimum `tilt_cosine` at which the hand counts as vertical."""
         return VERTICAL_COSINE_AROUND_DISC if self.occluded else rewards.VERTICAL_COSINE
 
     def reward_terms(self, physics: mjcf.Physics) -> rewards.Terms:
-        """Eq. 5: `reaching`, `vertical`, `floating`, `lifting`; `staged` also has `success`."""
+        """Return `reaching`, `vertical`, `floating`, `lifting` (Eq. 5); `staged` adds `success`."""
         assert self.target is not None
         return rewards.lift(
             self.hand_distance(physics),

@@ -8,25 +8,25 @@ from merl.tasks import rewards
 from merl.tasks.box import BOX_HALF_SIZE, BoxTask
 
 TARGET = (0.0, -0.2, BOX_HALF_SIZE)
-"""Where the centre of the box is to be, m: on the floor, nearer to the camera than it starts."""
+"""Target of the box's centre, m: on the floor, closer to the camera than every start."""
 MARK_RADIUS = 0.05
-"""Of the green patch around the target, m: wider than the box, which stands on it in the end."""
+"""Radius of the green mark around the target, m: it is wider than the box, which ends up on it."""
 MARK_HEIGHT = 0.001
-"""Of its upper face, m above the floor."""
+"""Height of the mark's upper face above the floor, m."""
 DISC_RADIUS = 0.085
-"""Of the disc that hides the box when `occluded`, m."""
+"""Radius of the disc that hides the box if `occluded`, m."""
 _GREEN = (0.0, 0.8, 0.0, 1.0)
 
 
 class MoveBox(BoxTask):
-    """Bring a cube to within 1 cm of a place on the floor (MERL B.1, Eq. 4)."""
+    """Bring a cube to within 1 cm of a target on the floor (MERL B.1, Eq. 4)."""
 
     term_names = ("reaching", "pushing")
     place = place_over_disc = TARGET
     disc_radius = DISC_RADIUS
 
-    def _furnish(self) -> None:
-        # An opaque patch that touches nothing: the ray tracer draws neither sites nor transparency.
+    def _add_objects(self) -> None:
+        # An opaque geom without contacts: renderer `raster` draws neither sites nor transparency.
         self._arena.mjcf_model.worldbody.add(
             "geom",
             name="mark",
@@ -39,7 +39,7 @@ class MoveBox(BoxTask):
         )
 
     def reward_terms(self, physics: mjcf.Physics) -> rewards.Terms:
-        """Eq. 4: `reaching` and `pushing`; the reward `staged` also has `success`."""
+        """Return `reaching` and `pushing` (Eq. 4); the reward `staged` adds `success`."""
         return rewards.move(
             self.hand_distance(physics), self.goal_distance(physics), form=self.reward
         )

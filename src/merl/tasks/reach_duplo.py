@@ -1,4 +1,4 @@
-"""Reach: bring the hand to a brick that lies on the floor."""
+"""Reach: bring the hand to a brick on the floor."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class ReachDuplo(JacoTask):
         super().__init__(prop=props.Duplo())
 
     def distance(self, physics: mjcf.Physics) -> float:
-        """From the tool centre point to the brick, m."""
+        """Return the distance from the tool centre point to the brick, m."""
         return self.hand_distance(physics)
 
     def reward_terms(self, physics: mjcf.Physics) -> dict[str, float]:
-        """Eq. 3: `reaching`, in [0, 1]."""
+        """Return `reaching`, in [0, 1] (Eq. 3)."""
         return rewards.reach(self.hand_distance(physics))

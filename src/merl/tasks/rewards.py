@@ -1,6 +1,6 @@
-"""The rewards of the paper (appendix B.2, Eqs. 3 to 5) as pure functions that return named terms.
+"""Rewards of the paper (appendix B.2, Eqs. 3 to 5) as pure functions that return named terms.
 
-Each term lies in [0, 1/N], where N is the number of stages of the task. Their sum is the reward, in
+Each term is in [0, 1/N], where N is the number of stages (terms). Their sum is the reward, in
 [0, 1]. Distances and heights are in metres.
 """
 
@@ -11,46 +11,46 @@ from typing import Literal
 from dm_control.utils.rewards import tolerance
 
 REACHING_DISTANCE = 0.05
-"""epsilon_reaching: the hand is at the object when its tool centre point is this near, m."""
+"""epsilon_reaching, m: the hand is at the object if its tool centre point is closer than this."""
 REACHING_MARGIN = 0.05
-"""Beyond epsilon_reaching the reward falls off as a gaussian of this width, to 0.1 there, m."""
+"""Beyond epsilon_reaching the reward falls as a Gaussian, to 0.1 after this margin, m."""
 GOAL_DISTANCE = 0.05
-"""epsilon_pushing and epsilon_lifting: the goal term is full when the object is this near to its
-target, m (the authors' later code)."""
+"""epsilon_pushing and epsilon_lifting, m: the goal term has its maximum if the object is at most
+this far from its target (the authors' later code)."""
 GOAL_MARGIN = 0.05
-"""Beyond that distance the goal term falls off with a long tail, to 0.1 after this margin, m."""
+"""Beyond `GOAL_DISTANCE` the goal term falls with a long tail, to 0.1 after this margin, m."""
 SUCCESS_DISTANCE = 0.01
-"""The task is solved when the object is this near to its target, m (MERL B.1)."""
+"""The task is solved if the object is at most this far from its target, m (MERL B.1)."""
 SUCCESS_MARGIN = 0.01
-"""Margin of the `success` term of the reward `staged`, long tail, m (the authors' later code)."""
+"""Margin of the long tail of the `success` term of `staged`, m (the authors' later code)."""
 VERTICAL_COSINE = 0.99
-"""1 - epsilon_vertical: the hand points down when the cosine of its tilt is at least this; below it
-the reward falls off as a gaussian whose margin is the same number."""
+"""1 - epsilon_vertical: the hand points down if the cosine of its tilt is at least this. Below, the
+reward falls as a Gaussian whose margin has the same value."""
 FLOATING_HEIGHT = 0.035
-"""epsilon_floating: the object is off the floor when its centre is above this, m."""
+"""epsilon_floating, m: the object is off the floor if its centre is higher than this."""
 
 FLOATING_FROM = 0.03
-"""Height of the object's centre at which the `floating` term of `staged` starts, m."""
+"""Height of the object's centre at which the `floating` term of `staged` starts to rise, m."""
 FLOATING_BELOW_TARGET = 0.01
-"""That term is scaled to a height this far below the target, m ..."""
+"""The `floating` term of `staged` is scaled to a height this far below the target, m."""
 FLOATING_SLOPE = 2.0
-"""... and multiplied by this, so that it is full half-way up."""
+"""Factor of the `floating` term of `staged`, which therefore has its maximum half-way up."""
 
 RewardForm = Literal["paper", "staged"]
-"""The reward of the tasks with a target.
+"""Form of the reward, for tasks with a target.
 
 - `paper`: Eqs. 4 and 5 with epsilon_pushing = epsilon_lifting = 0.05 as bound and margin.
-- `staged`: the authors' later code. It adds a `success` term (N = 3 and 5); `floating` is steeper
-  and paid only while the object is off the floor.
+- `staged`: the authors' later code. It adds a `success` term (N = 3 and 5). `floating` is steeper,
+  and is 0 unless the object is off the floor.
 """
 Terms = dict[str, float]
 
 
 def reach(hand_distance: float) -> Terms:
-    """Eq. 3, N = 1: bring the hand to the object.
+    """Return the terms of Eq. 3, N = 1: bring the hand to the object.
 
     Args:
-        hand_distance: from the tool centre point to the object, m.
+        hand_distance: distance from the tool centre point to the object, m.
 
     Returns:
         `reaching`, in [0, 1].
@@ -59,15 +59,16 @@ def reach(hand_distance: float) -> Terms:
 
 
 def move(hand_distance: float, goal_distance: float, *, form: RewardForm = "paper") -> Terms:
-    """Eq. 4: bring the object to a place on the floor, with the hand at the object.
+    """Return the terms of Eq. 4: bring the object to a target on the floor, hand at the object.
 
     Args:
-        hand_distance: from the tool centre point to the object, m.
-        goal_distance: from the object to its target, m.
-        form: which reward.
+        hand_distance: distance from the tool centre point to the object, m.
+        goal_distance: distance from the object to its target, m.
+        form: form of the reward.
 
     Returns:
-        `reaching` and `pushing`, each in [0, 1/2]; `staged`: also `success`, each in [0, 1/3].
+        `reaching` and `pushing`, each in [0, 1/2]. With `staged` also `success`, and each in
+        [0, 1/3].
     """
     at_object = hand_distance < REACHING_DISTANCE
     terms = {
@@ -89,23 +90,23 @@ def lift(
     vertical_cosine: float = VERTICAL_COSINE,
     form: RewardForm = "paper",
 ) -> Terms:
-    """Eq. 5: raise the object to a place in the air, with the hand pointing down.
+    """Return the terms of Eq. 5: raise the object to a target in the air, hand pointing down.
 
-    The last row of Eq. 5 asks only for the object's height. As in the authors' later code, the hand
-    must be at the object there too (docs/paper.md): a box that was thrown is not lifted.
+    The last row of Eq. 5 depends only on the object's height. Here the hand must also be at the
+    object, as in the authors' later code (docs/paper.md): a thrown box does not count as lifted.
 
     Args:
-        hand_distance: from the tool centre point to the object, m.
-        tilt_cosine: between the hand's axis and straight down, in [-1, 1].
-        height: of the object's centre above the floor, m.
-        target_height: of the target above the floor, m, above 0.
-        goal_distance: from the object to its target, m.
+        hand_distance: distance from the tool centre point to the object, m.
+        tilt_cosine: cosine between the hand's axis and straight down, in [-1, 1].
+        height: height of the object's centre above the floor, m.
+        target_height: height of the target above the floor, m, above 0.
+        goal_distance: distance from the object to its target, m.
         vertical_cosine: 1 - epsilon_vertical: bound and margin of the vertical term.
-        form: which reward.
+        form: form of the reward.
 
     Returns:
-        `reaching`, `vertical`, `floating` and `lifting`, each in [0, 1/4]; `staged`: also
-        `success`, each in [0, 1/5].
+        `reaching`, `vertical`, `floating` and `lifting`, each in [0, 1/4]. With `staged` also
+        `success`, and each in [0, 1/5].
     """
     at_object = hand_distance < REACHING_DISTANCE
     off_floor = at_object and height > FLOATING_HEIGHT

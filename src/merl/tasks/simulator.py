@@ -1,9 +1,9 @@
-"""The simulator, imported with care: its version is checked and no OpenGL is asked for.
+"""Import the simulator: check its version, and load it without OpenGL.
 
-MuJoCo and dm_control look for an OpenGL library while they are imported; where there is none they
-warn, and where `MUJOCO_GL` names one that is missing they fail. Physics needs none, so both are
-imported with OpenGL switched off, unless someone else imported them before; the renderer that wants
-OpenGL switches dm_control's on (`merl.envs.rendering`).
+MuJoCo and dm_control look for an OpenGL library when they are imported. They warn if there is none,
+and fail if `MUJOCO_GL` names a missing one. Physics needs no OpenGL, so this module imports both
+with OpenGL disabled, unless they are imported already. The OpenGL renderer enables OpenGL in
+dm_control later (`merl.envs.opengl`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from importlib.metadata import PackageNotFoundError, version
 from merl.core import MerlError
 
 PINS = {"mujoco": "3.17.0", "dm_control": "1.0.50"}
-"""The versions that work together: with mujoco 4, dm_control 1.0.50 fails in obscure ways."""
+"""The versions that work together: with mujoco 4, dm_control 1.0.50 fails with unclear errors."""
 
 
 def check_versions() -> None:
-    """Make sure that the simulator is the one that the tasks were built on.
+    """Check that the installed simulator has the supported versions.
 
     Raises:
         MerlError: a package of `PINS` is missing or has another version.
@@ -40,7 +40,7 @@ def check_versions() -> None:
 
 @contextmanager
 def environment(**variables: str) -> Iterator[None]:
-    """Set environment variables for as long as something that reads them is imported."""
+    """Set environment variables temporarily, while a module that reads them is imported."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -55,21 +55,21 @@ def environment(**variables: str) -> Iterator[None]:
 
 @contextmanager
 def quiet_inverse_kinematics() -> Iterator[None]:
-    """Drop dm_control's warnings of a pose that it cannot reach: it goes on to draw another."""
+    """Suppress dm_control's warnings about unreachable poses; it then draws another pose."""
 
-    def other(record: logging.LogRecord) -> bool:
+    def keep(record: logging.LogRecord) -> bool:
         return not record.getMessage().startswith("Failed to converge")
 
     logger = logging.getLogger("absl")
-    logger.addFilter(other)
+    logger.addFilter(keep)
     try:
         yield
     finally:
-        logger.removeFilter(other)
+        logger.removeFilter(keep)
 
 
 check_versions()
 with environment(MUJOCO_GL="disabled", DISABLE_RENDER_THREAD_OFFLOADING="1"):
     importlib.import_module("mujoco")
-    # Rendering in the calling thread: a thread of dm_control's own fails when Python exits first.
+    # Render in the calling thread: dm_control's render thread fails if Python exits first.
     importlib.import_module("dm_control._render.executor")

@@ -1,1 +1,1 @@
-"""A rasteriser for MuJoCo models as Warp kernels, the same source for CPU and CUDA."""
+"""Rasteriser for MuJoCo models, in Warp kernels with the same source for CPU and CUDA."""

@@ -1,7 +1,7 @@
-"""Warp kernels: which triangle is the nearest at each sample, for the camera and for each light.
+"""Warp kernels: find the nearest triangle at each sample, for the camera and for each light.
 
-`place_geoms` and `project` bring every vertex into the frame of each view, `cover` draws the
-triangles into its z-buffer.
+`place_geoms` and `project` transform every vertex into the frame of each view. `cover` draws the
+triangles into the z-buffer of a view.
 """
 
 from typing import Any
@@ -23,14 +23,14 @@ def place_geoms(
     out_offsets: wp.array2d(dtype=wp.vec3),
     out_eyes: wp.array2d(dtype=wp.vec4),
 ):
-    """Each drawn geom's pose in the frame of each view."""
+    """Compute the pose of each drawn geom in the frame of each view."""
     v, g = wp.tid()
     view = views[v]
     inverse = wp.transpose(view.axes)
     geom = surfaces.drawn[g]
     out_rotations[v, g] = inverse * rotations[geom]
     out_offsets[v, g] = inverse * (positions[geom] - view.eye)
-    # Where the view looks from, in the geom's frame: a point, or a direction without a place.
+    # Position of the viewer in the geom's frame: a point (w = 1), or only a direction (w = 0).
     local = wp.transpose(rotations[geom])
     if view.ortho == 1:
         back = local * wp.vec3(view.axes[0, 2], view.axes[1, 2], view.axes[2, 2])
@@ -42,7 +42,7 @@ def place_geoms(
 
 @wp.func
 def in_line(z: float) -> float:
-    """What an orthographic view has for 1 / depth: positive within a kilometre, and linear."""
+    """Return 1 / depth as orthographic views define it: linear, and positive within 1 km."""
     return 1.0 + 1.0e-3 * z
 
 
@@ -54,7 +54,7 @@ def project(
     offsets: wp.array2d(dtype=wp.vec3),
     out: wp.array2d(dtype=wp.vec3),
 ):
-    """Each vertex as (column, row, 1 / depth); 1 / depth <= 0 marks one before the near plane."""
+    """Compute each vertex as (column, row, 1 / depth); <= 0 means before the near plane."""
     v, n = wp.tid()
     view, part = views[v], surfaces.vertex_parts[n]
     rotation, offset = rotations[v, part[0]], offsets[v, part[0]]
@@ -74,7 +74,7 @@ def project(
 
 @wp.func
 def keep_nearest(keys: wp.array(dtype=wp.uint64), i: int, inverse: float, triangle: int):
-    """Nearer triangles have larger keys; of equally near ones the later has."""
+    """Keep the nearest triangle: it has the largest key; of equally near ones the later has."""
     bits = wp.cast(inverse, wp.uint32)
     wp.atomic_max(keys, i, (wp.uint64(bits) << wp.uint64(32)) | wp.uint64(triangle + 1))
 
@@ -123,7 +123,7 @@ def draw_triangle(
 
 @wp.func
 def on_near_plane(p: wp.vec3, q: wp.vec3, view: View) -> wp.vec3:
-    """Where the edge from p (behind) to q (in front) meets the near plane, projected."""
+    """Return the projected point where the edge from p (hidden) to q (visible) is clipped."""
     share = (-view.near - p[2]) / (q[2] - p[2])
     hit = p + share * (q - p)
     half = 0.5 * float(view.size)
@@ -144,9 +144,9 @@ def draw_clipped(
     t: int,
     keys: wp.array(dtype=Any),
 ):
-    """Draw what lies behind the near plane of a triangle that crosses it."""
+    """Draw the visible part of a triangle that crosses the near plane."""
     corners = surfaces.triangles[t]
-    # Turn the triangle until its first corner is in front and its last is behind.
+    # Rotate the corners until the first one is visible and the last one is hidden.
     i, j, k = corners[0], corners[1], corners[2]
     for _ in range(2):
         if not (projected[v, i][2] > 0.0 and projected[v, k][2] <= 0.0):
@@ -178,12 +178,12 @@ def cover(
     v: int,
     keys: wp.array(dtype=Any),
 ):
-    """Write each triangle where it is the nearest so far; clip what crosses the near plane."""
+    """Draw each triangle where it is the nearest so far; clip triangles at the near plane."""
     part = surfaces.triangle_parts[wp.tid()]
     g = part[0]
     eye, size = eyes[v, g], views[v].size
     for t in range(part[1], part[2]):
-        if wp.dot(surfaces.facing[t], eye) > 0.0:  # else it is seen from behind
+        if wp.dot(surfaces.facing[t], eye) > 0.0:  # else only its back is visible
             corners = surfaces.triangles[t]
             a = projected[v, corners[0]]
             b = projected[v, corners[1]]

@@ -1,4 +1,4 @@
-"""Images by a z-buffer and shadow maps: `renderer="raster"`, which needs no OpenGL."""
+"""Renderer with a z-buffer and shadow maps (`renderer="raster"`), which needs no OpenGL."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from merl.envs.raster.scene import Scene, build_scene
 from merl.envs.warp_runtime import compiling, start_warp
 
 SHADOW_TEXELS = 1.5
-"""Texels along an edge of a shadow map for each sample along an edge of the image."""
+"""Texels along an edge of a shadow map, per sample along an edge of the image."""
 INVISIBLE = 1e-3
-"""A highlight is left out where its strength falls below this share."""
+"""A highlight is not computed if its relative strength is below this."""
 
 
 class RasterRenderer:
-    """Draw a MuJoCo model with triangles, on one thread of the CPU.
+    """A renderer that draws a MuJoCo model as triangles, on one thread of the CPU.
 
-    Triangles, materials and textures are collected once; planes and sky are painted again only
-    when they, the camera or a light have moved.
+    Triangles, materials and textures are collected once. Planes and sky are painted again only if
+    they, the camera or a light have moved.
 
     Args:
-        physics: a `dm_control.mjcf.Physics`, whose model stays as it is.
+        physics: a `dm_control.mjcf.Physics`; its model is not changed.
         camera: the name of a camera in the model.
         size: height and width of the images, in pixels.
-        samples: samples along each edge of a pixel, 1 to 4; a pixel is their average, as if a
-            larger image were averaged over boxes.
-        device: Warp's name of the device that draws.
+        samples: samples along each edge of a pixel, 1 to 4; a pixel is the mean of its samples, as
+            if a larger image were averaged over boxes.
+        device: Warp's name of the device.
 
     Raises:
-        MerlError: the model has a geom that cannot be drawn, or no such camera, or size or samples
-            are out of range.
+        MerlError: the model has a geom that cannot be drawn, or it has no such camera, or size or
+            samples are out of range.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class RasterRenderer:
         self._scene = build_scene(self._model)
         self._planes = np.array([self._scene.drawn[n] for n in self._scene.planes], int)
         self._shadows = [n for n, light in enumerate(self._scene.lights) if light.casts_shadow]
-        self._still: tuple[bytes, ...] = ()
+        self._last_poses: tuple[bytes, ...] = ()
         self._allocate(size)
         self._describe_views()
         with compiling():
@@ -65,21 +65,21 @@ class RasterRenderer:
 
     def render(self) -> NDArray[np.uint8]:
         """See `rendering.Renderer`."""
-        image: NDArray[np.uint8] = self._drawn("shade", "colors")
+        image: NDArray[np.uint8] = self._render_array("shade", "colors")
         return image
 
     def render_depth(self) -> NDArray[np.float32]:
-        """Distance along the camera's axis, (size, size), m; infinite where nothing is hit."""
-        depth: NDArray[np.float32] = self._drawn("measure", "depth")
+        """Return the distance along the camera's axis, (size, size), m; infinite without a hit."""
+        depth: NDArray[np.float32] = self._render_array("measure", "depth")
         return depth
 
     def render_segmentation(self) -> NDArray[np.int32]:
-        """The geom that each pixel shows, (size, size); -1 for the sky."""
-        geoms: NDArray[np.int32] = self._drawn("measure", "geom")
+        """Return the geom that each pixel shows, (size, size); -1 for the sky."""
+        geoms: NDArray[np.int32] = self._render_array("measure", "geom")
         return geoms
 
     def close(self) -> None:
-        """Nothing to do: the arrays go with the renderer."""
+        """Do nothing: the arrays are freed with the renderer."""
 
     def _allocate(self, size: int) -> None:
         k, scene = self._structs, self._scene
@@ -146,7 +146,7 @@ class RasterRenderer:
         return surfaces
 
     def _describe_views(self) -> None:
-        """What does not move of the camera and the lights; `_aim` sets the rest."""
+        """Set the constant properties of the camera and the lights; `_aim` sets the others."""
         model, k = self._model, self._structs
         near = model.vis.map.znear * model.stat.extent
         self._view_rows = np.zeros(1 + len(self._shadows), k.View.numpy_dtype())
@@ -172,7 +172,7 @@ class RasterRenderer:
                 view["focal"] = 0.5 * self._shadow_side / reach
 
     def _record(self) -> dict[str, Any]:
-        """Every launch, recorded once: replaying one takes microseconds."""
+        """Record every launch once; replaying a launch takes microseconds."""
         wp, a = self._wp, self._arrays
         covering, shading = (
             import_module(f"merl.envs.raster.{name}") for name in ("cover", "shade")
@@ -221,8 +221,8 @@ class RasterRenderer:
             )
         return commands
 
-    def _drawn(self, launch: str, name: str) -> NDArray[Any]:
-        """Draw the scene as it stands; return a copy of one of the arrays that a launch fills."""
+    def _render_array(self, launch: str, name: str) -> NDArray[Any]:
+        """Draw the current scene; return a copy of the array `name`, which `launch` fills."""
         with self._lock:  # another thread would draw into the same arrays
             self._draw()
             self._launch(launch)
@@ -230,11 +230,11 @@ class RasterRenderer:
             return array
 
     def _draw(self) -> None:
-        """Everything but the colours: poses, background, z-buffer, shadow maps."""
+        """Compute everything except the colours: poses, background, z-buffer, shadow maps."""
         data = self._data
         self._arrays.positions.assign(data.geom_xpos)
         self._arrays.rotations.assign(data.geom_xmat.reshape(-1, 3, 3))
-        still = (
+        poses = (
             data.cam_xpos[self._camera].tobytes(),
             data.cam_xmat[self._camera].tobytes(),
             data.light_xpos.tobytes(),
@@ -242,13 +242,13 @@ class RasterRenderer:
             data.geom_xpos[self._planes].tobytes(),
             data.geom_xmat[self._planes].tobytes(),
         )
-        moved = still != self._still
+        moved = poses != self._last_poses
         if moved:
             self._aim()
         self._launch("place")
         if moved:
             self._launch("paint")
-            self._still = still
+            self._last_poses = poses
         self._arrays.keys.zero_()
         self._arrays.maps.zero_()
         self._launch("project")
@@ -257,11 +257,11 @@ class RasterRenderer:
 
     def _launch(self, name: str) -> None:
         command = self._commands[name]
-        if command is not None:  # as one is that has nothing to do
+        if command is not None:  # an empty launch records no command
             command.launch()
 
     def _aim(self) -> None:
-        """Where the camera and the lights are, and which way they look."""
+        """Set the positions and the directions of the camera and the lights."""
         data, views, lights = self._data, self._view_rows, self._light_rows
         views["eye"][0] = data.cam_xpos[self._camera]
         views["axes"][0] = data.cam_xmat[self._camera].reshape(3, 3)
@@ -279,10 +279,10 @@ class RasterRenderer:
 
 
 def _camera_of(model: Any, name: str) -> int:
-    """The index of a model's camera.
+    """Return the index of a camera of the model.
 
     Raises:
-        MerlError: there is no such camera, or its image is not a perspective with equal angles.
+        MerlError: there is no such camera, or it is orthographic or has a sensor size.
     """
     index = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name))
     if index < 0:
@@ -298,7 +298,7 @@ def _camera_of(model: Any, name: str) -> int:
 
 
 def _axes(direction: NDArray[Any]) -> NDArray[Any]:
-    """Axes (columns: right, up, backward) of a view that looks in a direction."""
+    """Return the axes (columns: right, up, backward) of a view that looks in a direction."""
     back = -direction / np.linalg.norm(direction)
     helper = (0.0, 1.0, 0.0) if abs(back[2]) > 0.9 else (0.0, 0.0, 1.0)
     right = np.cross(helper, back)

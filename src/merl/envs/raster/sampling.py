@@ -1,4 +1,4 @@
-"""Warp functions: colours from textures and from the sky, and light from shadow maps."""
+"""Warp functions: sample textures and the sky, and look up shadow maps."""
 
 import warp as wp
 
@@ -15,7 +15,7 @@ def texel(texels: wp.array(dtype=wp.vec3), level: Level, column: int, row: int) 
 
 @wp.func
 def sample_level(texels: wp.array(dtype=wp.vec3), level: Level, u: float, v: float) -> wp.vec3:
-    """Bilinear, repeating; u to the right and v down, both in textures."""
+    """Sample bilinearly, with repetition; u points right and v down, in units of textures."""
     x = (u - wp.floor(u)) * float(level.width) - 0.5
     y = (v - wp.floor(v)) * float(level.height) - 0.5
     left = wp.floor(x)
@@ -47,7 +47,7 @@ def sample_texture(
     v: float,
     texels_per_pixel: float,
 ) -> wp.vec3:
-    """Trilinear: between the two mipmap levels whose texels are about as large as a pixel."""
+    """Sample trilinearly, between the two mipmap levels with texels about as large as a pixel."""
     detail = wp.clamp(wp.log2(wp.max(texels_per_pixel, 1.0e-6)), 0.0, float(material.levels - 1))
     lower = int(detail)
     color = sample_level(texels, levels[material.texture + lower], u, v)
@@ -60,7 +60,7 @@ def sample_texture(
 
 @wp.func
 def sky(texels: wp.array(dtype=wp.vec3), level: Level, direction: wp.vec3) -> wp.vec3:
-    """The cube map's colour in a direction of the world; its six faces lie below one another."""
+    """Return the cube map's colour in a world direction; its six faces are stacked vertically."""
     # OpenGL's cube map axes: x, z and -y of the world (OpenGL 2.1 specification, table 3.19).
     r = wp.vec3(direction[0], direction[2], -direction[1])
     m = wp.abs(r)
@@ -95,9 +95,10 @@ def sky(texels: wp.array(dtype=wp.vec3), level: Level, direction: wp.vec3) -> wp
 
 @wp.func
 def in_shadow_map(view: View, point: wp.vec3, normal: wp.vec3, offset: float) -> wp.vec3:
-    """A point of the world as (column, row, 1 / depth) in a light's view.
+    """Return a world point as (column, row, 1 / depth) in the view of a light.
 
-    It is lifted off its surface by `offset` texels, so that the surface does not shadow itself.
+    The point is moved off its surface by `offset` texels, so that the surface does not shadow
+    itself.
     """
     inverse = wp.transpose(view.axes)
     p = inverse * (point - view.eye)
@@ -114,7 +115,7 @@ def in_shadow_map(view: View, point: wp.vec3, normal: wp.vec3, offset: float) ->
 
 @wp.func
 def lit_share(maps: wp.array3d(dtype=wp.float32), n: int, where: wp.vec3) -> float:
-    """How much of a light reaches a place in its shadow map, in [0, 1]: four texels, weighted."""
+    """Return the fraction of a light at a point of its shadow map, in [0, 1], from four texels."""
     x, y = where[0] - 0.5, where[1] - 0.5
     left, top = wp.floor(x), wp.floor(y)
     i, j = int(left), int(top)

@@ -1,4 +1,4 @@
-"""A MuJoCo model as the rasteriser draws it: triangles, materials, textures, lights."""
+"""Convert a MuJoCo model for the rasteriser: triangles, materials, textures, lights."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from merl.envs.raster.shapes import Shape, shape_of
 from merl.envs.raster.textures import Textures, pixels
 
 DRAWN_GROUPS = 3
-"""Geoms of the groups below this are drawn, as MuJoCo does by default."""
+"""Geoms in groups below this are drawn, as in MuJoCo by default."""
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
-"""A geom's own colour counts where it differs from this, else its material's."""
+"""A geom with this colour takes the colour of its material, if it has one."""
 
 PART = 64
-"""Most vertices or triangles that one thread takes."""
+"""Maximum number of vertices or triangles per thread."""
 
 Array = NDArray[Any]
 
 
 @dataclass
 class Light:
-    """A light, in OpenGL's terms; `index` is the model's, -1 for the headlight.
+    """A light, in OpenGL's terms; `index` is its index in the model, -1 for the headlight.
 
-    `cutoff` is the cosine of a spot's half angle (-1 for other lights), `attenuation` the constant,
-    linear and quadratic share.
+    `cutoff` is the cosine of a spot's half angle (-1 for other lights). `attenuation` holds the
+    constant, linear and quadratic coefficients.
     """
 
     index: int
@@ -46,7 +46,7 @@ class Light:
 
 @dataclass
 class Material:
-    """What a geom's surface is like; `texture` is its first mipmap level, -1 without."""
+    """Surface properties of a geom; `texture` is its first mipmap level, -1 if none."""
 
     color: Array
     emission: float = 0.0
@@ -54,30 +54,32 @@ class Material:
     shininess: float = 64.0
     texture: int = -1
     levels: int = 0
-    repeat: tuple[float, float] = (1.0, 1.0)  # textures per metre, of a plane
+    repeat: tuple[float, float] = (1.0, 1.0)  # textures per metre, for planes
 
 
 @dataclass
 class Scene:
-    """Everything that stays the same from image to image, T triangles with V vertices of G geoms.
+    """All data that is the same for every image: T triangles with V vertices of G geoms.
 
     Attributes:
-        drawn: the model's geoms that are drawn, (G,); geoms are counted in these below.
-        materials: of each drawn geom.
+        drawn: the model's geoms that are drawn, (G,); all geom indices below refer to these.
+        materials: the material of each drawn geom.
         planes: the drawn geoms that are planes, (P,); they have no triangles.
-        plane_sizes: half of their edges, (P, 2), m; 0 is infinite.
+        plane_sizes: half of their edge lengths, (P, 2), m; 0 means infinite.
         lights: the headlight, and the model's active lights.
         vertices: (V, 3), m, in their geom's frame.
         triangles: vertices of each triangle, (T, 3), counterclockwise from outside.
-        geom_of: (T,).
-        vertex_parts, triangle_parts: some vertices or triangles of one geom, which one thread
-            takes: (geom, first, last + 1).
-        facing: (T, 4); its product with (x, y, z, 1) is above 0 for points before the triangle.
-        normals, normal_of: unit vectors (N, 3), and those of each triangle's corners, (T, 3).
-        coordinates, coordinate_of: of textures, (C, 2), and of the corners, (T, 3), -1 for none.
+        geom_of: geom of each triangle, (T,).
+        vertex_parts, triangle_parts: vertices or triangles of one geom that one thread processes:
+            (geom, first, last + 1).
+        facing: (T, 4); its product with (x, y, z, 1) is above 0 in front of the triangle.
+        normals, normal_of: unit vectors (N, 3), and their indices for the corners, (T, 3).
+        coordinates, coordinate_of: texture coordinates (C, 2), and their indices for the corners,
+            (T, 3), -1 if none.
         density: texels per metre, (T,).
-        texels, levels: of all textures, (X, 3) in [0, 1], and (start, width, height) of each level.
-        sky: the level with the cube map of the sky, -1 without.
+        texels, levels: texels of all textures, (X, 3) in [0, 1], and (start, width, height) of each
+            level.
+        sky: the level with the cube map of the sky, -1 if none.
     """
 
     drawn: Array
@@ -102,10 +104,10 @@ class Scene:
 
 
 def build_scene(model: Any) -> Scene:
-    """Collect what is to be drawn of a MuJoCo model.
+    """Collect the visible parts of a MuJoCo model.
 
     Raises:
-        MerlError: a geom is of a kind that cannot be drawn, or the model has soft bodies.
+        MerlError: a geom has a type that cannot be drawn, or the model has soft bodies.
     """
     if model.nflex or model.nskin:
         raise MerlError(
@@ -129,7 +131,7 @@ def build_scene(model: Any) -> Scene:
             material.repeat = _repeats_per_metre(model, geom)
         else:
             shape = shape_of(model, geom)
-            if texture >= 0 and shape.coordinates is None:  # its colour without its pattern
+            if texture >= 0 and shape.coordinates is None:  # use the mean colour of the texture
                 material.texture = -1
                 material.color = material.color * pixels(model, texture).mean(axis=(0, 1))
             level = textures.levels[material.texture] if material.texture >= 0 else None
@@ -154,7 +156,7 @@ def build_scene(model: Any) -> Scene:
 
 
 class _Solids:
-    """The triangles of all geoms, one after another."""
+    """The triangles of all geoms, concatenated."""
 
     def __init__(self) -> None:
         self._parts: dict[str, list[Array]] = {
@@ -169,7 +171,7 @@ class _Solids:
         }
 
     def add(self, shape: Shape, geom: int, level: tuple[int, int, int] | None) -> None:
-        """Append a geom's triangles; `level` is the first of its texture, if it has one."""
+        """Append a geom's triangles; `level` is the first level of its texture, None if none."""
         triangles = len(shape.triangles)
         added = {
             "vertices": shape.vertices,
@@ -193,7 +195,7 @@ class _Solids:
         return sum(len(part) for part in self._parts[name])
 
     def arrays(self) -> dict[str, Array]:
-        """What `Scene` has of them."""
+        """Return the arrays for `Scene`."""
         whole = {name: np.concatenate(parts) for name, parts in self._parts.items()}
         reals = ("vertices", "normals", "coordinates", "density")
         arrays = {
@@ -212,7 +214,7 @@ class _Solids:
 
 
 def _parts(geoms: Array) -> Array:
-    """Cut what belongs to geoms into parts of one geom each: (geom, first, last + 1)."""
+    """Split rows, given their geoms, into parts of one geom each: (geom, first, last + 1)."""
     cuts = {0, len(geoms), *(np.flatnonzero(np.diff(geoms)) + 1).tolist()}
     parts = []
     for first, last in pairwise(sorted(cuts)):
@@ -240,7 +242,7 @@ def _material(model: Any, geom: int, rgba: Array) -> Material:
 
 
 def _texture_of(model: Any, geom: int) -> int:
-    """The geom's texture, -1 if it has none or one that is no plain image."""
+    """Return the geom's texture; -1 if it has none, or one that is not a plain image."""
     material = model.geom_matid[geom]
     if material < 0:
         return -1
@@ -250,7 +252,7 @@ def _texture_of(model: Any, geom: int) -> int:
 
 
 def _repeats_per_metre(model: Any, geom: int) -> tuple[float, float]:
-    """Textures per metre along a plane's two axes."""
+    """Return the textures per metre along a plane's two axes."""
     material, size = model.geom_matid[geom], model.geom_size[geom]
     if material < 0:
         return 1.0, 1.0
@@ -266,7 +268,7 @@ def _lights(model: Any) -> list[Light]:
     kinds, head = mujoco.mjtLightType, model.vis.headlight
     steady = np.array([1.0, 0.0, 0.0])
     lights = []
-    if head.active:  # it shines along the camera's axis from everywhere
+    if head.active:  # a directional light along the camera's axis
         lights.append(Light(-1, head.ambient, head.diffuse, head.specular, steady))
     for n in np.flatnonzero(model.light_active):
         kind = kinds(int(model.light_type[n]))

@@ -1,7 +1,7 @@
-"""Warp kernels: the colour of each pixel, by OpenGL's fixed lighting (Blinn-Phong).
+"""Warp kernels: compute the colour of each pixel, with OpenGL's fixed lighting (Blinn-Phong).
 
-`paint_background` colours planes and sky, which have no triangles, by the ray of each sample;
-`shade` colours each pixel by what is nearest in it; `measure` gives depth and geoms instead.
+`paint_background` colours planes and sky, which have no triangles, with a ray for each sample.
+`shade` colours each pixel from its nearest surfaces. `measure` writes depth and geoms instead.
 """
 
 import warp as wp
@@ -12,12 +12,12 @@ from merl.envs.raster.structs import Background, Light, Material, Shadowed, Surf
 wp.set_module_options({"enable_backward": False})
 
 SHADOW_OFFSET = wp.constant(1.5)
-"""How far a surface is lifted for its look into a shadow map, in texels."""
+"""Distance by which a point is moved off its surface for the shadow test, in texels."""
 
 
 @wp.func
 def reach_of(light: Light, point: wp.vec3) -> float:
-    """How strong a light is at a point: its attenuation and the fall-off of a spot."""
+    """Return the strength of a light at a point: its attenuation and the fall-off of a spot."""
     if light.directional == 1:
         return 1.0
     away = point - light.position
@@ -42,7 +42,7 @@ def reflect_light(
     normal: wp.vec3,
     viewer: wp.vec3,
 ) -> wp.vec3:
-    """Diffuse and specular light of the world's point (Blinn-Phong, as OpenGL's fixed lighting)."""
+    """Return diffuse and specular light from a world point (Blinn-Phong, as in OpenGL)."""
     to_light = -light.direction
     if light.directional == 0:
         to_light = wp.normalize(light.position - point)
@@ -60,10 +60,10 @@ def reflect_light(
 
 @wp.func
 def plane_inverse(rotation: wp.mat33, offset: wp.vec3, ray: wp.vec3) -> float:
-    """1 / depth at which a ray of the camera meets a plane from its front; 0: it does not."""
+    """Return 1 / depth where a camera ray hits the front of a plane; 0 if it does not hit it."""
     normal = wp.vec3(rotation[0, 2], rotation[1, 2], rotation[2, 2])
     height = wp.dot(normal, offset)
-    if height >= 0.0:  # the camera is below it
+    if height >= 0.0:  # the camera is below the plane
         return 0.0
     return wp.max(wp.dot(normal, ray) / height, 0.0)
 
@@ -79,12 +79,12 @@ def plane_base(
     inverse: float,
     pixel: float,
 ) -> wp.vec3:
-    """A plane's colour before it is lit, its texture filtered over the pixel."""
+    """Return the unlit colour of a plane, with its texture filtered over the pixel."""
     if material.texture < 0:
         return material.color
     local = wp.transpose(rotation) * (ray / inverse - offset)
     level = surfaces.levels[material.texture]
-    # How far the hit moves for one pixel to the right or down, by the plane's own axes.
+    # Motion of the hit point for one pixel to the right or down, in the plane's axes.
     normal = wp.vec3(rotation[0, 2], rotation[1, 2], rotation[2, 2])
     slope = wp.dot(normal, ray)
     right = (wp.vec3(pixel, 0.0, 0.0) - ray * (normal[0] * pixel / slope)) / inverse
@@ -113,7 +113,7 @@ def paint_background(
     behind: wp.array(dtype=Background),
     shadowed: wp.array2d(dtype=Shadowed),
 ):
-    """Planes and sky, once for as long as neither they nor the camera nor a light moves."""
+    """Colour planes and sky; to be repeated only after they, the camera or a light have moved."""
     row, column = wp.tid()
     camera = views[0]
     half = 0.5 * float(camera.size)
@@ -191,7 +191,7 @@ def color_of_triangle(
     a = projected[0, corners[0]]
     b = projected[0, corners[1]]
     c = projected[0, corners[2]]
-    share = wp.vec3(1.0, 0.0, 0.0)  # of a clipped triangle: its first corner's
+    share = wp.vec3(1.0, 0.0, 0.0)  # a clipped triangle uses its first corner
     if a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0:
         u = ((b[0] - x) * (c[1] - y) - (c[0] - x) * (b[1] - y)) * a[2]
         v = ((c[0] - x) * (a[1] - y) - (a[0] - x) * (c[1] - y)) * b[2]
@@ -247,7 +247,7 @@ def shade(
     samples: int,
     colors: wp.array3d(dtype=wp.uint8),
 ):
-    """Colour a row of pixels, each the mean of its samples."""
+    """Colour a row of pixels; each pixel is the mean of its samples."""
     row = wp.tid()
     side = views[0].size
     for column in range(colors.shape[1]):
@@ -293,7 +293,7 @@ def measure(
     depth: wp.array2d(dtype=float),
     geom: wp.array2d(dtype=int),
 ):
-    """Depth and geom of each pixel's first sample."""
+    """Write the depth and the geom of each pixel's first sample."""
     row, column = wp.tid()
     i = (row * depth.shape[1] * samples + column) * samples
     key = keys[i]

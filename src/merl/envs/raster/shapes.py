@@ -1,4 +1,4 @@
-"""Geoms as triangles, in their own frame, in metres."""
+"""Convert geoms to triangles, in the frame of the geom, in metres."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Array = NDArray[Any]
 
 @dataclass
 class Shape:
-    """T triangles: their corners, and each corner's normal and texture coordinates.
+    """T triangles: their corners, with the normal and texture coordinates of each corner.
 
     Attributes:
         vertices: (V, 3), m.
         triangles: indices of vertices, (T, 3), counterclockwise from outside.
         normals: unit vectors, (N, 3).
         normal_of: indices of normals, (T, 3).
-        coordinates: (C, 2) in textures, or None.
+        coordinates: texture coordinates, (C, 2), or None.
         coordinate_of: indices of coordinates, (T, 3), or None.
     """
 
@@ -35,7 +35,7 @@ class Shape:
     coordinate_of: Array | None = None
 
     def texels_per_metre(self, width: int, height: int) -> Array:
-        """How fine a texture of this size lies on each triangle, (T,); only with coordinates."""
+        """Return the texels per metre of a texture of this size, (T,); needs coordinates."""
         assert self.coordinates is not None
         assert self.coordinate_of is not None
         a, b, c = (self.vertices[self.triangles[:, n]] for n in range(3))
@@ -47,10 +47,12 @@ class Shape:
 
 
 def shape_of(model: Any, geom: int) -> Shape:
-    """The triangles of a geom that is not a plane; curved ones as finely as the model asks.
+    """Return the triangles of a geom that is not a plane.
+
+    The resolution of curved geoms is set in the model (`vis.quality`).
 
     Raises:
-        MerlError: it is of a type without triangles here (height field, signed distance field).
+        MerlError: the type of the geom is not supported (height field, signed distance field).
     """
     kinds, size = mujoco.mjtGeom, np.array(model.geom_size[geom])
     kind = kinds(model.geom_type[geom])
@@ -100,9 +102,9 @@ def _box(half: Array) -> Shape:
 
 
 def _ellipsoid(radii: Array, slices: int, stacks: int, half_length: float = 0.0) -> Shape:
-    """Rings from the upper to the lower pole; a capsule's halves are pulled apart along z."""
+    """Build rings from the upper to the lower pole; a capsule's halves are shifted along z."""
     polar = np.linspace(0, np.pi, stacks + stacks % 2 + 1)
-    if half_length:  # the middle ring once for each half
+    if half_length:  # one middle ring for each half
         polar = np.insert(polar, len(polar) // 2, np.pi / 2)
     rings, around = len(polar), np.linspace(0, 2 * np.pi, slices, endpoint=False)
     unit = np.stack(

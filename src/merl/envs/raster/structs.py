@@ -1,8 +1,8 @@
 """Structures that the rasteriser's Warp kernels share.
 
-Conventions: a view looks along -z with +x to the right and +y up, as a MuJoCo camera does. The
-depth of a point is its distance along the viewing direction, in metres; the buffers compare
-1 / depth. Of what each view has, the camera's comes first.
+Conventions: a view looks along -z with +x to the right and +y up, like a MuJoCo camera. The depth
+of a point is its distance along the viewing direction, in metres; the buffers compare 1 / depth. In
+arrays with one entry per view, the camera is first.
 """
 
 import warp as wp
@@ -10,7 +10,7 @@ import warp as wp
 
 @wp.struct
 class View:
-    """A pinhole camera, or a light seen as one.
+    """A pinhole camera, or a light that is treated as a camera.
 
     `eye` and `axes` (columns: right, up, backward) are in the world's frame; `focal` is in pixels,
     `size` is the number of samples along an edge; orthographic views have `ortho` = 1 and `focal`
@@ -27,7 +27,7 @@ class View:
 
 @wp.struct
 class Light:
-    """A light of the model; angles as cosines."""
+    """A light of the model; angles are stored as cosines."""
 
     position: wp.vec3
     direction: wp.vec3
@@ -39,12 +39,12 @@ class Light:
     exponent: float
     directional: int
     shiny: int  # has a specular colour
-    shadow: int  # index of its shadow map, -1 without
+    shadow: int  # index of its shadow map, -1 if none
 
 
 @wp.struct
 class Material:
-    """How a surface reflects light; `texture` is the index of its first mipmap level, or -1."""
+    """Properties of a surface; `texture` is the index of its first mipmap level, -1 if none."""
 
     color: wp.vec3
     emission: float
@@ -58,7 +58,7 @@ class Material:
 
 @wp.struct
 class Level:
-    """One mipmap level: where its texels start, and how many there are."""
+    """One mipmap level: the index of its first texel, its width and its height."""
 
     start: int
     width: int
@@ -67,15 +67,15 @@ class Level:
 
 @wp.struct
 class Surfaces:
-    """What can be hit, as `scene.Scene`: triangles, planes, and what they look like."""
+    """Visible surfaces, as in `scene.Scene`: triangles, planes, materials and textures."""
 
-    drawn: wp.array(dtype=int)  # the model's geoms that are drawn; all other geoms count in these
+    drawn: wp.array(dtype=int)  # the model's drawn geoms; all other geom indices refer to these
     vertices: wp.array(dtype=wp.vec3)
     vertex_parts: wp.array(dtype=wp.vec3i)  # geom, first, last + 1
     triangles: wp.array(dtype=wp.vec3i)
     geom_of: wp.array(dtype=int)
     triangle_parts: wp.array(dtype=wp.vec3i)
-    facing: wp.array(dtype=wp.vec4)  # of a triangle's plane: above 0 for points in front of it
+    facing: wp.array(dtype=wp.vec4)  # plane of a triangle: above 0 for points in front of it
     normals: wp.array(dtype=wp.vec3)
     normal_of: wp.array(dtype=wp.vec3i)
     coordinates: wp.array(dtype=wp.vec2)
@@ -86,14 +86,14 @@ class Surfaces:
     materials: wp.array(dtype=Material)
     texels: wp.array(dtype=wp.vec3)
     levels: wp.array(dtype=Level)
-    sky: int  # the level with the sky's cube map, -1 without
+    sky: int  # the level with the sky's cube map, -1 if none
 
 
 @wp.struct
 class Background:
-    """A sample of what lies behind all triangles: a plane (its geom) or the sky (geom -1).
+    """The background of a sample, behind all triangles: a plane (its geom) or the sky (geom -1).
 
-    `color` is what the lights without a shadow map give.
+    `color` contains only the light of the lights without a shadow map.
     """
 
     color: wp.vec3
@@ -103,7 +103,7 @@ class Background:
 
 @wp.struct
 class Shadowed:
-    """What a light with a shadow map adds to a sample, and where its map says whether it does."""
+    """Colour that a light with a shadow map adds to a sample, and the point in its map to test."""
 
     color: wp.vec3
     where: wp.vec3

@@ -1,4 +1,4 @@
-"""Textures as the rasteriser samples them: mipmap levels, one after another in one array."""
+"""Textures for the rasteriser: mipmap levels, concatenated in one array."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ class Textures:
     """All textures of a model.
 
     Attributes:
-        levels: (start, width, height) of each mipmap level; `start` is where its texels begin.
+        levels: (start, width, height) of each mipmap level; `start` is the index of its first
+            texel.
     """
 
     def __init__(self) -> None:
@@ -23,10 +24,10 @@ class Textures:
         self._added: dict[int, tuple[int, int]] = {}
 
     def add(self, model: Any, texture: int) -> tuple[int, int]:
-        """Append a texture's mipmap levels, once.
+        """Append the mipmap levels of a texture, unless they were appended before.
 
         Returns:
-            The index of the first level, and how many there are.
+            The index of the first level, and the number of levels.
         """
         if texture not in self._added:
             image, first = pixels(model, texture), len(self.levels)
@@ -38,14 +39,14 @@ class Textures:
         return self._added[texture]
 
     def add_sky(self, model: Any, texture: int) -> int:
-        """Append a cube map, whose six faces lie below one another; returns its level."""
+        """Append a cube map, whose six faces are stacked vertically; return its level."""
         image = pixels(model, texture)
-        faces = 6 if image.shape[0] == image.shape[1] else 1  # one face serves for all
+        faces = 6 if image.shape[0] == image.shape[1] else 1  # one image for all faces
         self._append(np.concatenate([image] * faces))
         return len(self.levels) - 1
 
     def texels(self) -> Array:
-        """The texels of all levels, float32 (X, 3), in [0, 1]."""
+        """Return the texels of all levels, float32 (X, 3), in [0, 1]."""
         return np.concatenate(self._texels).astype(np.float32)
 
     def _append(self, image: Array) -> None:
@@ -55,7 +56,7 @@ class Textures:
 
 
 def pixels(model: Any, texture: int) -> Array:
-    """A texture of the model as (height, width, 3), in [0, 1]."""
+    """Return a texture of the model as (height, width, 3), in [0, 1]."""
     shape = int(model.tex_height[texture]), int(model.tex_width[texture])
     channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
     data = model.tex_data[start : start + shape[0] * shape[1] * channels]
@@ -64,7 +65,7 @@ def pixels(model: Any, texture: int) -> Array:
 
 
 def halved(image: Array) -> Array:
-    """Half as high and wide (rounded down, at least 1), each texel the mean of what it covers."""
+    """Return an image of half the size (rounded down, at least 1), averaged over areas."""
     for axis in (0, 1):
         count = image.shape[axis]
         half = max(1, count // 2)

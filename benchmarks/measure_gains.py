@@ -57,9 +57,9 @@ def main(precision: Literal["bf16", "fp32"] = "bf16", repeats: int = 5) -> None:
             for name, change in changes.items():
                 with change(agents[name]):
                     agents[name].update(batch)
-                    begun = time.process_time()
+                    start = time.process_time()
                     agents[name].update(batch)
-                    taken[name].append(time.process_time() - begun)
+                    taken[name].append(time.process_time() - start)
     whole = median(taken["as it is"])
     for name, seconds in taken.items():
         print(f"| {name} | {1e3 * median(seconds):,.0f} ms | {median(seconds) / whole - 1:+.1%} |")

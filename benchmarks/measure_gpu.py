@@ -192,9 +192,9 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
     works: dict[str, tuple[UpdateOnDevice, DDPG]] = {}
     for name, form in forms.items():
         try:
-            begun = time.perf_counter()
+            start = time.perf_counter()
             works[name] = work_of(agent, batch_size, form)
-            print(f"{name}: ready in {time.perf_counter() - begun:.1f} s", file=sys.stderr)
+            print(f"{name}: ready in {time.perf_counter() - start:.1f} s", file=sys.stderr)
         except Exception as error:
             print(f"{name}: skipped, {type(error).__name__}: {error}", file=sys.stderr)
     rates: dict[str, list[float]] = {name: [] for name in works}
@@ -258,11 +258,11 @@ def kernels(agent: str, batch_size: int, *, compiled: bool, updates: int = 20) -
 def seconds(work: Callable[[], object], times: int) -> float:
     """Return the seconds that `times` calls of `work` take, with the GPU's work."""
     wait()
-    begun = time.perf_counter()
+    start = time.perf_counter()
     for _ in range(times):
         work()
     wait()
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
 def wait() -> None:

@@ -58,9 +58,9 @@ def compare(name: str, update: Work) -> None:
             keep_freed_memory(keep)
             update()
             for _ in range(UPDATES):
-                faults, begun = _faults(), time.process_time()
+                faults, start = _faults(), time.process_time()
                 update()
-                results.append((time.process_time() - begun, _faults() - faults))
+                results.append((time.process_time() - start, _faults() - faults))
     for keep, results in taken.items():
         seconds, faults = (median(values) for values in zip(*results, strict=True))
         how = "kept" if keep else "given back"

@@ -65,7 +65,7 @@ def figures3and5() -> Iterator[tuple[str, str]]:
 
 
 def boxes() -> Iterator[tuple[str, str]]:
-    """Yield MERL with six layers, from camera and joints, on the box tasks with the default start."""
+    """Yield MERL (six layers, camera and joints) on the box tasks; starts as in the paper."""
     for reward in ("staged", "paper"):
         for task in BOXES:
             yield (

@@ -29,9 +29,9 @@ def main(preset: str = "laptop", task: str = "reach_duplo", steps: int = 3000) -
     save = Saver.save
 
     def timed(saver: Saver) -> bool:
-        begun = time.perf_counter()
+        start = time.perf_counter()
         done = save(saver)
-        taken.append(time.perf_counter() - begun)
+        taken.append(time.perf_counter() - start)
         return done
 
     with patch.object(Saver, "save", timed), tempfile.TemporaryDirectory(dir=".") as folder:

@@ -118,7 +118,7 @@ def soak(
     rng, segments = random.Random(0), list[Segment]()
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        begun, lasts = time.monotonic(), rng.uniform(*between)
+        start, lasts = time.monotonic(), rng.uniform(*between)
         process = subprocess.Popen(
             [sys.executable, "-m", "merl.cli", *line],
             stdout=subprocess.DEVNULL,
@@ -126,7 +126,7 @@ def soak(
             text=True,
         )
         memory: list[int] = []
-        while time.monotonic() - begun < lasts:
+        while time.monotonic() - start < lasts:
             if process.poll() is not None:
                 _, error = process.communicate()
                 raise SystemExit(f"the run ended by itself with {process.returncode}: {error}")
@@ -142,7 +142,7 @@ def soak(
         first, last = half[: len(half) // 4 + 1], half[-(len(half) // 4 + 1) :]
         segments.append(
             Segment(
-                time.monotonic() - begun,
+                time.monotonic() - start,
                 step,
                 max(0, reached - step),
                 (int(np.median(first)), int(np.median(last))),

@@ -1,4 +1,4 @@
-"""What is installed: the wheel, on its own; and what `make` shows while it installs."""
+"""The wheel works alone, and `install.sh` shows its progress."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def call(*command: str | Path, cwd: Path, **variables: str) -> str:
-    """Call a program that does not see the source; returns its output."""
+    """Call a program without the source in PYTHONPATH; return its output."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | variables
     done = subprocess.run(
         [*map(str, command)], cwd=cwd, env=environment, capture_output=True, text=True
@@ -34,13 +34,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def build_path() -> str:
-    """The folder of hatchling, which may lie outside this environment."""
+    """Return the folder of hatchling, which may be outside this environment."""
     import hatchling
 
     return str(Path(hatchling.__path__[0]).parent)
 
 
-def test_the_wheel_has_every_file_of_the_package_and_whole_metadata(wheel: Path) -> None:
+def test_the_wheel_has_all_files_of_the_package_and_its_metadata(wheel: Path) -> None:
     assert wheel.name.startswith("merl_rl-")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
@@ -61,7 +61,7 @@ def test_the_wheel_has_every_file_of_the_package_and_whole_metadata(wheel: Path)
         assert line in lines
     described = "\n".join(lines[lines.index("") :])
     assert "another project" in described
-    assert "![" not in described  # on a package index there are no files beside the page
+    assert "![" not in described  # a package index does not show images and files of the repository
     assert "](docs" not in described
 
 
@@ -74,13 +74,13 @@ print(merl.__file__, merl.__version__, version("merl-rl"), len(references("lift_
 
 
 def test_the_wheel_works_in_an_environment_without_the_source(wheel: Path, tmp_path: Path) -> None:
-    """A fresh environment, which borrows nothing but what the wheel requires."""
+    """The environment is new and has access only to the installed requirements."""
     call(sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv", cwd=tmp_path)
     python = tmp_path / "venv/bin/python"
     pip = [sys.executable, "-m", "pip", "--python", python]
     call(*pip, "install", "--quiet", "--no-deps", "--no-index", wheel, cwd=tmp_path)
     (packages,) = tmp_path.glob("venv/lib/python*/site-packages")
-    # Unlike that of a `.pth` file there, the path files in the borrowed folder are not followed.
+    # Python ignores `.pth` files in the folder that this file adds, so the source stays hidden.
     (packages / "borrowed.pth").write_text(sysconfig.get_path("purelib"))
 
     file, version, recorded, measured = call(python, "-c", PROBE, cwd=tmp_path).split()
@@ -107,7 +107,7 @@ exit EXIT
 
 
 @pytest.mark.parametrize("code", [0, 1])
-def test_installing_shows_large_downloads_and_that_it_goes_on(code: int, tmp_path: Path) -> None:
+def test_install_shows_large_downloads_and_progress(code: int, tmp_path: Path) -> None:
     pip = tmp_path / "pip"
     pip.write_text(PIP.replace("EXIT", str(code)))
     pip.chmod(0o755)
@@ -122,6 +122,6 @@ def test_installing_shows_large_downloads_and_that_it_goes_on(code: int, tmp_pat
     lines = [line.split(maxsplit=1)[1] for line in done.stdout.splitlines()]
     assert lines[0] == "torch 2.13.0+cpu (190.5 MB)"
     assert set(lines[1:-1]) == {"installing 3 packages"}
-    assert len(lines) >= 4  # again, while nothing else happens
+    assert len(lines) >= 4  # repeated while pip prints nothing
     assert lines[-1] == "installed"
     assert (tmp_path / "arguments").read_text().split()[-2:] == ["--editable", ".[dev]"]

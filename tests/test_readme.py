@@ -1,4 +1,4 @@
-"""The README's commands, as somebody pastes them after `make train`."""
+"""The README's commands work in their order after `make train`, and its links exist."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def commands() -> list[list[str]]:
-    """The arguments of each line `$ merl ...` of a console block, in order."""
+    """Return the arguments of each line `$ merl ...` in the console blocks, in order."""
     blocks = re.findall(r"```console\n(.*?)```", README, re.DOTALL)
     lines = [line for block in blocks for line in block.splitlines()]
     return [shlex.split(line, comments=True)[2:] for line in lines if line.startswith("$ merl ")]
 
 
-def test_each_line_names_a_run_that_an_earlier_line_leaves(
+def test_each_command_names_a_run_of_an_earlier_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -35,8 +35,8 @@ def test_each_line_names_a_run_that_an_earlier_line_leaves(
 
     monkeypatch.setattr("merl.cli.train.begin", begin)
     makefile = (ROOT / "Makefile").read_text()
-    (of_make,) = re.findall(r"\$\(BIN\)/merl (train .*)", makefile)
-    assert main(of_make.replace("$(MINUTES)", "10").split()) == 0
+    (make_command,) = re.findall(r"\$\(BIN\)/merl (train .*)", makefile)
+    assert main(make_command.replace("$(MINUTES)", "10").split()) == 0
     named = []
     for command, *arguments in commands():
         assert command in COMMANDS
@@ -51,12 +51,12 @@ def test_each_line_names_a_run_that_an_earlier_line_leaves(
     assert {Path(run).absolute() for run in loaded} <= runs
 
 
-def test_torch_without_cuda_and_the_name_on_the_index_are_explained() -> None:
+def test_readme_explains_torch_without_cuda_and_the_package_name() -> None:
     assert "--index-url https://download.pytorch.org/whl/cpu" in README
     assert "merl-rl" in README
     assert "another project" in README
 
 
-def test_images_and_links_lead_to_files() -> None:
+def test_images_and_links_exist() -> None:
     for target in re.findall(r'(?:\]\(|src=")([^)"#]+)', README):
         assert target.startswith("https://") or (ROOT / target).exists(), target

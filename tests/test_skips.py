@@ -1,4 +1,4 @@
-"""The rule of `conftest.py`: no test is skipped for a reason that is not on the list."""
+"""`conftest.py` fails a test that is skipped for a reason that is not on its list."""
 
 from __future__ import annotations
 

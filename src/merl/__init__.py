@@ -23,17 +23,38 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load_policy", "make_env"]
+__all__ = [
+    "Callback",
+    "TrainConfig",
+    "Trainer",
+    "__version__",
+    "evaluate",
+    "load_policy",
+    "make_env",
+    "train",
+]
 
 from merl.envs.registration import register as _register
 
 _register()
 
 if TYPE_CHECKING:
+    from merl.api import evaluate, train
+    from merl.config import TrainConfig
     from merl.envs import make_env
     from merl.evaluation.evaluation import load_policy
+    from merl.training.callbacks import Callback
+    from merl.training.trainer import Trainer
 
-_PUBLIC = {"make_env": "merl.envs", "load_policy": "merl.evaluation.evaluation"}
+_PUBLIC = {
+    "Callback": "merl.training.callbacks",
+    "TrainConfig": "merl.config",
+    "Trainer": "merl.training.trainer",
+    "evaluate": "merl.api",
+    "load_policy": "merl.evaluation.evaluation",
+    "make_env": "merl.envs",
+    "train": "merl.api",
+}
 
 
 def __getattr__(name: str) -> Any:

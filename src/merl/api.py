@@ -1,14 +1,12 @@
-"""Train, resume and evaluate from Python.
+"""Train and evaluate from Python.
 
-    import merl
-
+Example:
     outcome = merl.train("reach_duplo", steps=100_000, **{"agent.noise_std": 0.3})
     print(merl.evaluate(outcome.run.path, episodes=50).success_end)
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,6 @@ from typing import Any
 from merl.config import Setting, TrainConfig, override
 from merl.envs.config import RendererName
 from merl.evaluation.evaluation import Evaluation, load_policy
-from merl.evaluation.evaluation import evaluate as evaluate_policy
-from merl.evaluation.video import MIN_SIDE
 from merl.experiments.presets import compose, default_preset
 from merl.training.callbacks import Callback
 from merl.training.trainer import Outcome, Trainer
@@ -85,24 +81,10 @@ def evaluate(
         MerlError: the run cannot be loaded, or its environment is not trusted.
     """
     policy = load_policy(run, checkpoint=checkpoint)
-    changes: dict[str, Any] = {} if renderer is None else {"renderer": renderer}
-    if video is not None:
-        size = max(policy.config.env.render_size, MIN_SIDE)
-        changes |= {"render_mode": "rgb_array", "render_size": size}
-    limits = policy.config.eval
-    if max_episode_steps is not None:
-        limits = dataclasses.replace(limits, max_episode_steps=max_episode_steps)
-    config = dataclasses.replace(policy.config, eval=limits)
-    env = policy.make_env(trust=trust, **changes)
-    try:
-        return evaluate_policy(
-            policy,
-            env,
-            episodes,
-            reset=policy.reset,
-            video=None if video is None else Path(video).absolute(),
-            max_steps=config.eval_steps,
-            reports_success=policy.reports_success,
-        )
-    finally:
-        env.close()
+    return policy.evaluate(
+        episodes=episodes,
+        video=None if video is None else Path(video).absolute(),
+        renderer=renderer,
+        max_episode_steps=max_episode_steps,
+        trust=trust,
+    )

@@ -1,4 +1,4 @@
-"""The bench runs and says what it measured; the figures themselves are not tested."""
+"""The bench of the environment runs and shows its result; the speeds are not tested."""
 
 import json
 
@@ -16,7 +16,7 @@ def text_of(result):
     return flat(capture.get())
 
 
-def test_every_side_is_timed():
+def test_every_variant_is_timed():
     result = bench.run(repeats=2, steps=6, image_size=32)
     assert json.loads(json.dumps(result)) == result
     shown = text_of(result)
@@ -28,7 +28,7 @@ def test_every_side_is_timed():
     assert result["overhead"]["median"] > -1
 
 
-def test_without_opengl_that_side_is_left_out(monkeypatch):
+def test_dm_control_is_skipped_without_opengl(monkeypatch):
     def missing(_):
         raise MerlError("no OpenGL here")
 

@@ -1,4 +1,4 @@
-"""The bench runs and says what it measured; the figures themselves are not tested."""
+"""The bench of the replay runs and shows its result; the times are not tested."""
 
 import json
 
@@ -10,7 +10,7 @@ from merl.bench import replay as bench
 from merl.core import MerlError
 
 
-def test_both_sides_are_timed():
+def test_raw_and_compressed_replay_are_timed():
     result = bench.run(repeats=1, steps=500, batch_size=4)
     assert json.loads(json.dumps(result)) == result
     console = Console(width=300, markup=False)
@@ -25,7 +25,7 @@ def test_both_sides_are_timed():
     assert result["picture_bytes"][bench.COMPRESSED] < result["picture_bytes"][bench.RAW] / 4
 
 
-def test_where_temporary_files_have_no_room_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_disk_space_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "free_disk", lambda _: 200_000_000)
-    with pytest.raises(MerlError, match=r"takes 0\.27 GB .* name a larger folder in TMPDIR"):
+    with pytest.raises(MerlError, match=r"takes 0\.27 GB .* set TMPDIR to a larger folder"):
         bench.run(repeats=1)

@@ -1,3 +1,5 @@
+"""The bench of the training loop runs and shows its result; the speeds are not tested."""
+
 from __future__ import annotations
 
 import json
@@ -8,7 +10,7 @@ from helpers import flat
 from merl.bench import train
 
 
-def test_every_way_to_run_the_loop_is_timed() -> None:
+def test_every_variant_of_the_loop_is_timed() -> None:
     result = train.run(repeats=1, steps=6, preset="smoke")
     assert len(result["steps_per_s"]) == 3
     assert all(0 < rate["low"] <= rate["high"] for rate in result["steps_per_s"].values())

@@ -1,4 +1,4 @@
-"""The bench's reference makes the same update; the figures themselves are not tested."""
+"""The reference of the bench equals merl's update; the speeds are not tested."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def ours(agent: str, layers: int) -> DDPG:
     return made
 
 
-def plainly(agent: str, layers: int) -> Plain:
+def reference(agent: str, layers: int) -> Plain:
     size = {"layers": layers, "width": WIDTH}
     if agent == "merl":
         plain = Plain(9, SIDE, PROPRIO, ACTIONS, **size)
@@ -58,7 +58,7 @@ def plainly(agent: str, layers: int) -> Plain:
 
 
 def pairs(mine: DDPG, plain: Plain) -> Iterator[tuple[nn.Parameter, nn.Parameter]]:
-    """The same parameter on both sides."""
+    """Yield each parameter of merl's agent with the reference's."""
     networks = mine.networks
 
     def zipped(one: nn.Module | None, other: nn.Module) -> Iterator[tuple[Tensor, Tensor]]:
@@ -82,7 +82,7 @@ def pairs(mine: DDPG, plain: Plain) -> Iterator[tuple[nn.Parameter, nn.Parameter
 
 
 def as_plain(value: Tensor, other: Tensor) -> Tensor:
-    """A projection of the picture reads rows, columns, channels here, channels first there."""
+    """Reorder a projection of image features: the reference has channels first, merl last."""
     if value.ndim == 2 and value.shape[1] == FEATURES:
         side = int((FEATURES // 32) ** 0.5)
         value = value.reshape(-1, side, side, 32).permute(0, 3, 1, 2).flatten(1)
@@ -91,8 +91,8 @@ def as_plain(value: Tensor, other: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize(("agent", "layers"), [("merl", 6), ("drqv2", 3)])
-def test_the_reference_makes_the_same_update(agent: str, layers: int) -> None:
-    mine, plain = ours(agent, layers), plainly(agent, layers)
+def test_reference_and_agent_make_the_same_update(agent: str, layers: int) -> None:
+    mine, plain = ours(agent, layers), reference(agent, layers)
     with torch.no_grad():
         for one, other in pairs(mine, plain):
             other.copy_(as_plain(one, other))
@@ -123,7 +123,8 @@ def test_the_reference_makes_the_same_update(agent: str, layers: int) -> None:
         critic_loss, actor_loss = plain.learn(sample, *noises, *swapped)
         torch.testing.assert_close(losses["critic_loss"], critic_loss, rtol=1e-8, atol=0)
         torch.testing.assert_close(losses["actor_loss"], actor_loss, rtol=1e-8, atol=0)
-        # Written plainly, the actor's loss reaches the critic's heads too: look at their weights.
+        # In the reference the actor's loss adds to the gradients of the critic's heads, so only
+        # their weights are compared.
         heads = {id(p) for q in (plain.critic.first, plain.critic.second) for p in q.parameters()}
         for one, other in pairs(mine, plain):
             if id(other) not in heads:
@@ -134,7 +135,7 @@ def test_the_reference_makes_the_same_update(agent: str, layers: int) -> None:
             assert (as_plain(one, other) - other).norm() <= 1e-8 * other.norm()
 
 
-def test_it_runs_and_shows_every_side(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_variant_is_timed_and_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(*_: object) -> None:
         raise MerlError('not installed: pip install "merl-rl[bench]"')
 
@@ -153,7 +154,7 @@ def test_it_runs_and_shows_every_side(monkeypatch: pytest.MonkeyPatch) -> None:
         assert result["updates_per_s"][side]["median"] > 0
         assert side in shown
     assert "two cores" in shown
-    result["machine"]["gpu"] = "a card"  # which has bars of its own
+    result["machine"]["gpu"] = "a GPU"  # it has other targets
     with console.capture() as capture:
         console.print(bench.table(result))
     assert "two cores" not in flat(capture.get())

@@ -1,4 +1,4 @@
-"""The command line end to end, in the `smoke` preset, as a newcomer would use it."""
+"""The command line end to end, mostly with preset `smoke`."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from merl.evaluation.evaluation import EVALUATION_SEED
 
 MERL = [sys.executable, "-m", "merl.cli"]
 SMALL_VIDEO = ["--render-size", "64"]
-"""With `small_videos()`; at full size an episode takes half a minute to trace."""
+"""Flags for use with `small_videos()`; rendering an episode at full size takes half a minute."""
 
 
 @contextlib.contextmanager
 def small_videos() -> Iterator[None]:
-    """Let frames be traced at less than the least size; they are enlarged to it."""
+    """Allow rendering below the minimum size of a video; the video enlarges the frames."""
     with pytest.MonkeyPatch.context() as patch:
         for module in ("merl.training.setup", "merl.cli.evaluate"):
             patch.setattr(f"{module}.MIN_SIDE", 16)
@@ -46,7 +46,7 @@ def small_videos() -> Iterator[None]:
 
 
 def folder_name() -> str:
-    """A name that needs quotes, in the characters that this locale has."""
+    """Return a name that needs quotes, in characters that this locale supports."""
     name = "a run, [größer]"
     try:
         os.fsencode(name)
@@ -57,16 +57,16 @@ def folder_name() -> str:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole `smoke` run, trained once."""
+    """Train a whole `smoke` run once; return its folder."""
     folder = tmp_path_factory.mktemp("runs") / folder_name()
     arguments = ["train", "reach_duplo", "--preset", "smoke", "--run-dir", str(folder)]
     out, err = io.StringIO(), io.StringIO()
     with small_videos(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         assert main([*arguments, "--threads", "1", *SMALL_VIDEO]) == 0
     shown = flat(out.getvalue())
-    assert shown.startswith("preset smoke (as asked for")
-    for said in ("take about", "MB for 1,000 steps", "random actions", "best known", "too early"):
-        assert said in shown
+    assert shown.startswith("preset smoke (as requested")
+    for text in ("take about", "MB for 1,000 steps", "random actions", "best known", "too early"):
+        assert text in shown
     assert f"merl resume '{folder}' --steps" in out.getvalue()
     assert f"learning curve: {folder}/curve.png" in out.getvalue()
     assert "Traceback" not in err.getvalue()
@@ -78,7 +78,7 @@ def rows(run: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_a_run_leaves_what_the_docs_promise(run: Path) -> None:
+def test_a_run_writes_the_documented_files(run: Path) -> None:
     record = json.loads((run / "config.json").read_text())
     assert record["config"]["env"]["renderer"] == "raster"
     assert record["config"]["agent"]["precision"] in ("fp32", "bf16")
@@ -102,7 +102,7 @@ def test_metrics_have_a_row_for_every_episode_and_evaluation(run: Path) -> None:
         assert table[-1][name] != ""
 
 
-def test_the_video_is_real(run: Path) -> None:
+def test_the_video_shows_a_whole_episode_with_motion(run: Path) -> None:
     (path,) = (run / "videos").glob("*.mp4")
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
@@ -114,18 +114,18 @@ def test_the_video_is_real(run: Path) -> None:
     assert np.abs(frames[0].astype(int) - frames[-1].astype(int)).mean() > 0.5
 
 
-def test_evaluate_and_a_policy_driven_by_hand_agree_exactly(run: Path, tmp_path: Path) -> None:
-    output, film = tmp_path / "out.json", tmp_path / "film.mp4"
+def test_evaluate_equals_a_loop_with_load_policy(run: Path, tmp_path: Path) -> None:
+    output, video = tmp_path / "out.json", tmp_path / "film.mp4"
     arguments = ["evaluate", str(run), "--episodes", "2", "--json", str(output)]
     with small_videos():
-        assert main([*arguments, "--video", str(film)]) == 0
-    assert film.stat().st_size > 1000
-    told = json.loads(output.read_text())
-    assert told["step"] == 1000
+        assert main([*arguments, "--video", str(video)]) == 0
+    assert video.stat().st_size > 1000
+    evaluation = json.loads(output.read_text())
+    assert evaluation["step"] == 1000
 
     policy = merl.load_policy(run)
     env = merl.make_env("reach_duplo", renderer="raster", image_size=32)
-    for index, episode in enumerate(told["episodes"]):
+    for index, episode in enumerate(evaluation["episodes"]):
         assert episode["seed"] == EVALUATION_SEED + index
         observation, _ = env.reset(seed=episode["seed"])
         policy.reset()
@@ -137,9 +137,9 @@ def test_evaluate_and_a_policy_driven_by_hand_agree_exactly(run: Path, tmp_path:
     env.close()
 
 
-def test_a_hostile_folder_is_evaluated_without_importing_from_it(run: Path, tmp_path: Path) -> None:
-    """One of merl's own tasks, called in the run's folder, which names itself for modules."""
-    folder = tmp_path / "stranger"
+def test_evaluating_a_hostile_folder_imports_nothing_from_it(run: Path, tmp_path: Path) -> None:
+    """Evaluate one of merl's own tasks in the run's folder, which is also its module folder."""
+    folder = tmp_path / "hostile"
     shutil.copytree(run, folder)
     record = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(record | {"module_folder": str(folder)}))
@@ -152,7 +152,7 @@ def test_a_hostile_folder_is_evaluated_without_importing_from_it(run: Path, tmp_
     assert not (folder / "imported").exists()
 
 
-def test_a_policy_says_what_it_misses(run: Path) -> None:
+def test_a_policy_rejects_incomplete_observations(run: Path) -> None:
     policy = merl.load_policy(run)
     with pytest.raises(merl.core.MerlError, match="lacks 'proprio'"):
         policy({"image": np.zeros((32, 32, 3), np.uint8)})
@@ -162,14 +162,17 @@ def test_a_policy_says_what_it_misses(run: Path) -> None:
 
 def test_evaluating_with_the_other_renderer_warns(run: Path) -> None:
     policy = merl.load_policy(run)
-    with pytest.warns(UserWarning, match="trained with renderer 'raster'"), _closing_gl():
+    with (
+        pytest.warns(UserWarning, match="trained with renderer 'raster'"),
+        _tolerating_missing_gl(),
+    ):
         policy.make_env(renderer="gl", observations=("proprio",)).close()
 
 
-def test_evaluating_with_gl_takes_one_sample(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluating_with_gl_uses_one_sample(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, made = merl.load_policy(run), list[dict[str, object]]()
-    seen = dataclasses.replace(policy.config.env, samples=2)
-    policy.config = dataclasses.replace(policy.config, env=seen)
+    env_config = dataclasses.replace(policy.config.env, samples=2)
+    policy.config = dataclasses.replace(policy.config, env=env_config)
     monkeypatch.setattr(
         "merl.evaluation.evaluation.make_run_env", lambda config, **changes: made.append(changes)
     )
@@ -179,7 +182,7 @@ def test_evaluating_with_gl_takes_one_sample(run: Path, monkeypatch: pytest.Monk
     assert made == [{"renderer": "gl", "samples": 1}, {"renderer": "raster"}]
 
 
-def test_auto_is_the_renderer_of_the_training(run: Path, recwarn: pytest.WarningsRecorder) -> None:
+def test_renderer_auto_is_that_of_training(run: Path, recwarn: pytest.WarningsRecorder) -> None:
     policy = merl.load_policy(run)
     env = policy.make_env(renderer="auto", observations=("proprio",))
     assert env.unwrapped.config.renderer == policy.config.env.renderer == "raster"  # type: ignore[attr-defined]
@@ -187,8 +190,8 @@ def test_auto_is_the_renderer_of_the_training(run: Path, recwarn: pytest.Warning
     assert not list(recwarn)
 
 
-def _closing_gl():  # type: ignore[no-untyped-def]
-    """Without an OpenGL library the environment is refused after the warning, which is enough."""
+def _tolerating_missing_gl():  # type: ignore[no-untyped-def]
+    """Ignore that making the environment fails after the warning, where OpenGL is missing."""
     return contextlib.suppress(merl.core.MerlError)
 
 
@@ -206,13 +209,13 @@ def train_arguments(folder: Path, *more: str, task: str = "reach_duplo") -> list
 
 
 def train_the_dot(folder: Path, *more: str) -> list[str]:
-    """The same for an environment whose steps cost nothing: 20 to an episode."""
-    few = ["--random-steps", "20", "--seed-steps", "40", "--eval.no-references"]
-    return train_arguments(folder, *few, *more, task="merl.envs.dot:whole")
+    """Return arguments for an environment with fast steps and episodes of 20 steps."""
+    short = ["--random-steps", "20", "--seed-steps", "40", "--eval.no-references"]
+    return train_arguments(folder, *short, *more, task="merl.envs.dot:whole")
 
 
 def last_saved(run: Path) -> int:
-    """The step of the last checkpoint; 0 without one."""
+    """Return the step of the last checkpoint; 0 without one."""
     folder = run / "checkpoints"
     names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
     return max((int(name) for name in names if name.isdigit()), default=0)
@@ -231,8 +234,8 @@ def assert_same(one: Path, other: Path) -> None:
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_resuming_at_an_episodes_end_is_exact(tmp_path: Path) -> None:
-    """One run in one go, another stopped half-way: the same weights and the same metrics."""
+def test_resume_at_an_episode_end_is_bit_exact(tmp_path: Path) -> None:
+    """An uninterrupted and a resumed run have the same weights and the same metrics."""
     every = ["--eval.every", "250", "--random-steps", "100", "--seed-steps", "150"]
     assert main(train_arguments(tmp_path / "whole", *every, "--steps", "500")) == 0
     assert main(train_arguments(tmp_path / "parts", *every, "--steps", "250")) == 0
@@ -253,7 +256,7 @@ def test_same_seed_same_weights(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
+def test_a_signal_saves_and_prints_how_to_resume(tmp_path: Path, number: int, code: int) -> None:
     folder = tmp_path / "run"
     command = [*MERL, *train_the_dot(folder, "--steps", "2000000")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -274,7 +277,9 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code:
     assert steps[-1] == saved + 50
 
 
-def test_one_process_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_one_process_may_train_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "run"
     command = [*MERL, *train_the_dot(folder, "--steps", "2000000", "--eval.every", "100")]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -303,7 +308,7 @@ def test_one_process_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert not (folder / "replay").exists()
 
 
-def test_minutes_end_a_run_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_minutes_limit_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = train_the_dot(tmp_path / "run", "--steps", "2000000", "--minutes", "0.02")
     assert main(arguments) == 0
     shown = flat(capsys.readouterr().out)
@@ -314,7 +319,7 @@ def test_minutes_end_a_run_in_time(tmp_path: Path, capsys: pytest.CaptureFixture
     assert int(row["step"]) < 2_000_000
 
 
-def test_lines_to_paste_are_whole_on_a_narrow_terminal(
+def test_commands_and_paths_are_not_wrapped_on_a_narrow_terminal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=60, markup=False)
@@ -328,15 +333,17 @@ def test_lines_to_paste_are_whole_on_a_narrow_terminal(
     assert f"learning curve: {folder}/curve.png" in shown
     outlook = shown[shown.index("preset smoke") : shown.index("the replay takes")]
     assert all(len(line) <= 60 for line in outlook.splitlines())
-    assert flat(outlook).startswith("preset smoke (as asked for; the whole pipeline in under")
+    assert flat(outlook).startswith("preset smoke (as requested; the whole pipeline in under")
 
 
-def test_what_cannot_learn_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_updates_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(train_the_dot(tmp_path / "run", "--steps", "40")) == 0
     assert "nothing will be learnt" in flat(capsys.readouterr().out)
 
 
-def test_a_sense_that_nobody_consumes_is_not_there(tmp_path: Path) -> None:
+def test_an_unused_observation_is_not_computed(tmp_path: Path) -> None:
     arguments = train_arguments(tmp_path / "run", "--steps", "300", "--agent.images")
     assert main(arguments) == 0
     record = json.loads((tmp_path / "run" / "config.json").read_text())
@@ -396,7 +403,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("line", BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(
+def test_bad_input_is_one_line_and_writes_nothing(
     line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -409,16 +416,16 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-NOT_TO_BE_WRITTEN = {
+UNWRITABLE = {
     "nowhere/figures.json": "No such file or directory",
     ".": "Is a directory",
     "a" * 300: "File name too long",
 }
 
 
-@pytest.mark.parametrize("name", NOT_TO_BE_WRITTEN)
+@pytest.mark.parametrize("name", UNWRITABLE)
 @pytest.mark.parametrize("command", ["bench update", "evaluate nothing"])
-def test_where_nothing_can_be_written_is_said_before_the_work(
+def test_an_unwritable_output_file_is_reported_before_the_work(
     command: str,
     name: str,
     tmp_path: Path,
@@ -426,33 +433,33 @@ def test_where_nothing_can_be_written_is_said_before_the_work(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("merl.cli.bench.BENCHES", {"update": ()})  # nothing that could be called
+    monkeypatch.setattr("merl.cli.bench.BENCHES", {"update": ()})  # calling a bench would fail
     assert main([*command.split(), "--json", name]) == 2
     error = capsys.readouterr().err
-    assert f"merl: error: {name} cannot be written: {NOT_TO_BE_WRITTEN[name]}: " in error
+    assert f"merl: error: {name} cannot be written: {UNWRITABLE[name]}: " in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_to_be_written_is_as_it_was_until_then(tmp_path: Path) -> None:
-    figures, link = tmp_path / "figures.json", tmp_path / "link.json"
-    figures.write_text("of another run")
+def test_a_failed_command_does_not_change_its_output_file(tmp_path: Path) -> None:
+    numbers, link = tmp_path / "numbers.json", tmp_path / "link.json"
+    numbers.write_text("of another run")
     link.symlink_to(tmp_path / "elsewhere")
-    for path in (figures, link, tmp_path / "new.json"):
+    for path in (numbers, link, tmp_path / "new.json"):
         assert main(["evaluate", str(tmp_path / "none"), "--json", str(path)]) == 2
-    assert figures.read_text() == "of another run"
+    assert numbers.read_text() == "of another run"
     assert link.is_symlink()
     assert not (tmp_path / "new.json").exists()
 
 
-def test_what_may_be_left_out_is_not_offered_as_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_none_is_not_offered_as_a_choice(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "nowhere", "--renderer", "wrap"]) == 2
     error = capsys.readouterr().err
     assert "'raster'" in error
     assert "None" not in error
 
 
-def test_where_updates_cannot_be_compiled_the_run_says_so_and_begins(
+def test_a_run_continues_if_compiling_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*_: object, **__: object) -> None:
@@ -461,13 +468,13 @@ def test_where_updates_cannot_be_compiled_the_run_says_so_and_begins(
     monkeypatch.setattr(torch, "compile", fail)
     monkeypatch.setattr("merl.training.timing.worth_compiling", lambda *_: True)  # as on a GPU
     assert main(train_the_dot(tmp_path / "run", "--steps", "60")) == 0
-    told = capsys.readouterr()
-    assert "updates are not compiled, which fails here: no compiler" in flat(told.out)
-    assert "Traceback" not in told.err
+    printed = capsys.readouterr()
+    assert "updates are not compiled because compiling fails: no compiler" in flat(printed.out)
+    assert "Traceback" not in printed.err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-def test_cuda_where_there_is_none(
+def test_device_cuda_without_cuda_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -478,7 +485,7 @@ def test_cuda_where_there_is_none(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_folder_is_left_alone(
+def test_an_existing_folder_is_not_changed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine").write_text("precious")
@@ -488,7 +495,7 @@ def test_an_existing_folder_is_left_alone(
 
 
 @pytest.mark.parametrize("opengl", [{"MUJOCO_GL": "disabled"}, {"MUJOCO_GL": "glfw"}])
-def test_gl_without_opengl_names_the_way_on(tmp_path: Path, opengl: dict[str, str]) -> None:
+def test_gl_without_opengl_suggests_raster(tmp_path: Path, opengl: dict[str, str]) -> None:
     arguments = ["train", "reach_duplo", "--preset", "smoke", "--renderer", "gl"]
     done = subprocess.run(
         [*MERL, *arguments],
@@ -496,7 +503,7 @@ def test_gl_without_opengl_names_the_way_on(tmp_path: Path, opengl: dict[str, st
         text=True,
         check=False,
         cwd=tmp_path,
-        env=os.environ | opengl | {"DISPLAY": ":77"},  # where no screen is
+        env=os.environ | opengl | {"DISPLAY": ":77"},  # a display that does not exist
         timeout=600,
     )
     assert done.returncode == 2
@@ -505,7 +512,7 @@ def test_gl_without_opengl_names_the_way_on(tmp_path: Path, opengl: dict[str, st
     assert list(tmp_path.iterdir()) == []
 
 
-def test_it_trains_where_opengl_is_switched_off(tmp_path: Path) -> None:
+def test_training_works_with_opengl_disabled(tmp_path: Path) -> None:
     arguments = train_arguments(tmp_path / "run", "--steps", "260", "--seed-steps", "240")
     done = subprocess.run(
         [*MERL, *arguments],
@@ -519,29 +526,27 @@ def test_it_trains_where_opengl_is_switched_off(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_tasks_are_listed_with_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tasks_are_listed_with_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tasks", "--pictures", str(tmp_path / "pictures")]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for task, env_id in ENV_IDS.items():
-        assert f"\n    merl train {task} --preset laptop\n" in told
+        assert f"\n    merl train {task} --preset laptop\n" in printed
         make = f"import gymnasium; env = gymnasium.make('merl:{env_id}')"
-        assert f"\n    {make}\n" in told
+        assert f"\n    {make}\n" in printed
         made: dict[str, Any] = {}
         exec(make, made)
         made["env"].close()
         assert imread(tmp_path / "pictures" / f"{task}.png").shape == (480, 480, 3)
-    assert "reaching + vertical + floating + lifting" in told
-    lines = [line.strip() for line in told.splitlines()]
+    assert "reaching + vertical + floating + lifting" in printed
+    lines = [line.strip() for line in printed.splitlines()]
     assert "merl train move_box --preset laptop --occluded" in lines
     (tmp_path / "file").write_text("in the way")
     assert main(["tasks", "--pictures", str(tmp_path / "file")]) == 2
     assert "cannot be written" in capsys.readouterr().err
 
 
-def test_the_state_alone_can_be_learnt_from(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Preset state on a box task, cut short: no picture but the video's, every term told."""
+def test_training_from_the_state_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Preset state on a box task, shortened: no image but the video's, and all reward terms."""
     sizes = ["--steps", "250", "--random-steps", "100", "--seed-steps", "230"]
     folder = tmp_path / "run"
     arguments = ["train", "lift_box", "--preset", "state", *sizes, "--eval.episodes", "1"]
@@ -560,7 +565,7 @@ def test_the_state_alone_can_be_learnt_from(
     assert list((folder / "videos").iterdir())
 
 
-def test_a_reader_that_goes_away_is_no_error() -> None:
+def test_a_closed_output_pipe_is_not_an_error() -> None:
     process = subprocess.Popen(
         [*MERL, "train", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -572,7 +577,7 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert process.returncode == 141
 
 
-def test_ctrl_c_before_training_says_that_nothing_was_written(
+def test_ctrl_c_before_training_writes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stop(*_: object, **__: object) -> None:
@@ -586,7 +591,7 @@ def test_ctrl_c_before_training_says_that_nothing_was_written(
 
 
 @pytest.mark.parametrize(
-    ("damage", "told"),
+    ("damage", "message"),
     [
         (lambda record: record.update(observation_space=[]), "cannot be read"),
         (lambda record: record["config"].update(env=None), "env is None"),
@@ -605,8 +610,8 @@ def test_ctrl_c_before_training_says_that_nothing_was_written(
         (lambda record: record.update(format=99), "it has format 99"),
     ],
 )
-def test_a_damaged_config_is_one_line(  # type: ignore[no-untyped-def]
-    run: Path, tmp_path: Path, damage, told: str, capsys: pytest.CaptureFixture[str]
+def test_a_damaged_config_is_reported_in_one_line(  # type: ignore[no-untyped-def]
+    run: Path, tmp_path: Path, damage, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "run").mkdir()
     record = json.loads((run / "config.json").read_text())
@@ -617,7 +622,7 @@ def test_a_damaged_config_is_one_line(  # type: ignore[no-untyped-def]
         error = capsys.readouterr().err
         assert error.count("\n") == 1
         assert "config.json cannot be read: " in error
-        assert told in error
+        assert message in error
 
 
 def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -637,9 +642,9 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     "state",
     [{}, {"progress": 3}, {"progress": {"evaluated": 1}, "replay": {"open": False}}],
-    ids=["empty", "progress is a number", "half"],
+    ids=["empty", "progress is a number", "incomplete"],
 )
-def test_a_state_that_lacks_something_is_one_line(
+def test_an_incomplete_state_is_reported_in_one_line(
     run: Path, tmp_path: Path, state: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     copy = tmp_path / "run"
@@ -647,12 +652,12 @@ def test_a_state_that_lacks_something_is_one_line(
     for checkpoint in (copy / "checkpoints").iterdir():
         file, manifest = checkpoint / "state.json", checkpoint / "manifest.json"
         file.write_text(json.dumps(state))
-        told = json.loads(manifest.read_text())
-        told["files"]["state.json"] = {
+        content = json.loads(manifest.read_text())
+        content["files"]["state.json"] = {
             "bytes": file.stat().st_size,
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
         }
-        manifest.write_text(json.dumps(told))
+        manifest.write_text(json.dumps(content))
     capsys.readouterr()
     assert main(["resume", str(copy), "--steps", "2000"]) == 2
     error = capsys.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 from merl.cli.output import make_console
 
 
-def test_where_no_terminal_is_lines_are_not_wrapped(
+def test_lines_are_not_wrapped_without_a_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "60")

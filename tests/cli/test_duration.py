@@ -1,4 +1,4 @@
-"""What a run says about its duration, and numbers with their nouns."""
+"""The printed duration of a run, and numbers with their nouns."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ WHOLE = "1,000 steps of x:y on cpu"
 
 
 @pytest.mark.parametrize(
-    ("number", "said"),
+    ("number", "text"),
     [(0, "0 steps"), (1, "1 step"), (2, "2 steps"), (150_000, "150,000 steps"), (0.5, "0.5 steps")],
 )
-def test_numbers_agree_with_their_nouns(number: float, said: str) -> None:
-    assert counted(number, "step") == said
+def test_numbers_agree_with_their_nouns(number: float, text: str) -> None:
+    assert counted(number, "step") == text
     assert counted(1.0, "minute") == "1 minute"
 
 
 @pytest.mark.parametrize(
-    ("values", "knows_env", "done", "said"),
+    ("values", "knows_env", "done", "line"),
     [
         ({}, True, 0, f"{WHOLE} take about 0:03:20"),
         ({}, True, 999, "1 step of x:y on cpu takes about 0:02:23"),
@@ -45,12 +45,12 @@ def test_numbers_agree_with_their_nouns(number: float, said: str) -> None:
             {"minutes": 1.0},
             False,
             0,
-            f"{WHOLE} in at most 1 minute (how long they take is said after the first 50)",
+            f"{WHOLE} in at most 1 minute (their duration is printed after the first 50)",
         ),
         ({}, False, 990, "10 steps of x:y on cpu"),
     ],
 )
-def test_duration_in_one_line(values: Any, knows_env: bool, done: int, said: str) -> None:
+def test_duration_in_one_line(values: Any, knows_env: bool, done: int, line: str) -> None:
     config = TrainConfig(
         "x:y",
         steps=1000,
@@ -59,7 +59,6 @@ def test_duration_in_one_line(values: Any, knows_env: bool, done: int, said: str
         replay=ReplayConfig(batch_size=8),
         **values,
     )
-    # Ten episodes of evaluation, of 250 steps each, come on top.
+    # Ten evaluation episodes of 250 steps each are included.
     timing = Timing({Arithmetic("fp32", 1): 0.0}, 200 / 3500, knows_env=knows_env)
-    told = duration(config, timing, done)
-    assert told == said
+    assert duration(config, timing, done) == line

@@ -1,4 +1,4 @@
-"""`merl info` and `merl bench`: what the machine offers, as the command line tells it."""
+"""`merl info` and `merl bench` on the command line."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from merl.cli import main
 from merl.cli.info import _rows
 
 
-def test_info_tells_versions_processor_memory_and_renderers(
+def test_info_shows_versions_processor_memory_and_renderers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("merl.bench.renderers.FRAMES", 2)
-    told = dict(takewhile(lambda row: not row[0].startswith("preset"), _rows()))
-    assert told["merl"] == merl.__version__
-    assert told["mujoco"] == "3.17.0"
-    assert "cores" in told["processor"]
-    assert float(told["memory"].split()[0]) > 0.1
-    speed = told["renderer raster"]
+    shown = dict(takewhile(lambda row: not row[0].startswith("preset"), _rows()))
+    assert shown["merl"] == merl.__version__
+    assert shown["mujoco"] == "3.17.0"
+    assert "cores" in shown["processor"]
+    assert float(shown["memory"].split()[0]) > 0.1
+    speed = shown["renderer raster"]
     assert speed.endswith("frames/s at 84x84")
     assert float(speed.split()[0]) > 0
-    assert told["renderer gl"]
+    assert shown["renderer gl"]
 
 
 @pytest.mark.long
-def test_info_tells_what_each_preset_would_take(capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_shows_the_expected_speed_of_each_preset(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info"]) == 0
     shown = flat(capsys.readouterr().out)
     assert "preset laptop" in shown
@@ -39,7 +39,9 @@ def test_info_tells_what_each_preset_would_take(capsys: pytest.CaptureFixture[st
     assert re.search(r"preset laptop about [\d,.]+ steps/s and [\d,.]+ updates/s", shown)
 
 
-def test_bench_env_writes_what_it_shows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_env_prints_and_writes_its_result(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     output = tmp_path / "bench.json"
     assert main(["bench", "env", "--repeats", "1", "--json", str(output)]) == 0
     shown = flat(capsys.readouterr().out)
@@ -49,7 +51,9 @@ def test_bench_env_writes_what_it_shows(tmp_path: Path, capsys: pytest.CaptureFi
     assert ("ratio" in result) != ("skipped" in result)
 
 
-def test_bench_refuses_what_cannot_be(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_refuses_zero_repeats_and_prints_its_usage(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["bench", "env", "--repeats", "0"]) == 2
     assert "--repeats must be at least 1" in capsys.readouterr().err
     assert main(["bench"]) == 0

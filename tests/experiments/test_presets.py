@@ -1,4 +1,4 @@
-"""Presets are values: the paper's numbers, what a task changes in them, and what an agent does."""
+"""The values of the presets: the paper's numbers, and the changes for tasks and agents."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ def test_presets_for_machines_without_opengl_use_raster(preset: str) -> None:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_users_environment_is_not_moved_to_compare_unless_asked(preset: str) -> None:
+def test_references_are_not_measured_in_a_user_environment_by_default(preset: str) -> None:
     assert compose(preset, "move_box").eval.references
     assert not compose(preset, "my_robot:make").eval.references
     assert not TrainConfig("my_robot:make").eval.references
@@ -41,9 +41,7 @@ def test_a_users_environment_is_not_moved_to_compare_unless_asked(preset: str) -
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_of_a_users_environment_there_is_one_and_it_is_not_moved_at_random_for_long(
-    preset: str,
-) -> None:
+def test_a_user_environment_is_a_single_one_with_few_random_steps(preset: str) -> None:
     config = compose(preset, "my_robot:make")
     assert (config.num_envs, config.synchronous) == (1, True)
     assert config.random_steps <= 5000
@@ -58,12 +56,12 @@ def test_preset_laptop_uses_both_cores_for_merls_own_tasks() -> None:
 
 
 @pytest.mark.parametrize(("task", "layers"), [("reach_duplo", 3), ("move_box", 6), ("lift_box", 6)])
-def test_the_heads_of_preset_paper_follow_the_task(task: str, layers: int) -> None:
+def test_head_layers_of_preset_paper_depend_on_the_task(task: str, layers: int) -> None:
     assert compose("paper", task).agent.head_layers == layers
     assert compose("laptop", task).agent.head_layers == 3
 
 
-def test_every_preset_takes_every_agent() -> None:
+def test_every_preset_accepts_every_agent() -> None:
     for preset, chosen in PRESETS.items():
         assert compose(preset, "lift_box").agent_name == chosen.agent_name
         for name, agent in AGENTS.items():
@@ -75,10 +73,10 @@ def test_every_preset_takes_every_agent() -> None:
                 assert getattr(config.agent, field) == value
 
 
-def test_published_is_what_the_authors_ran() -> None:
+def test_setting_published_has_the_authors_values() -> None:
     drqv2 = compose("paper", "reach_duplo", "drqv2", "published")
     assert (drqv2.action_repeat, drqv2.updates_per_step) == (2, 0.25)
-    # 500,000 decisions of two steps each
+    # the noise falls over 500,000 actions of two steps each
     assert (drqv2.agent.noise(0), drqv2.agent.noise(500_000)) == (1.0, pytest.approx(0.55))
     assert drqv2.agent.noise(10**7) == pytest.approx(0.1)
     assert drqv2.agent == dataclasses.replace(AGENTS["drqv2"], noise_steps=1_000_000)
@@ -94,7 +92,7 @@ def test_published_is_what_the_authors_ran() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("labtop", "x"), "did you mean 'laptop'"),
         (("laptop", "x", "drq"), "did you mean 'drqv2'"),
@@ -102,6 +100,6 @@ def test_published_is_what_the_authors_ran() -> None:
         (("laptop", "x", "merl", "published"), "'merl' has no setting published"),
     ],
 )
-def test_what_there_is_not(arguments: tuple, says: str) -> None:  # type: ignore[type-arg]
-    with pytest.raises(MerlError, match=says):
+def test_unknown_names_are_refused(arguments: tuple, message: str) -> None:  # type: ignore[type-arg]
+    with pytest.raises(MerlError, match=message):
         compose(*arguments)

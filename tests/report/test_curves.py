@@ -20,7 +20,7 @@ def line(steps, values):
     return Curve(np.array(steps, dtype=float), np.array(values, dtype=float))
 
 
-def test_reads_every_column_with_nan_where_nothing_was_measured(run):
+def test_empty_cells_are_read_as_nan(run):
     metrics = read_metrics(run)
     assert list(metrics) == ["step", "train/return", "eval/return", "time/seconds"]
     np.testing.assert_array_equal(metrics["step"], [10, 20, 30])
@@ -28,36 +28,38 @@ def test_reads_every_column_with_nan_where_nothing_was_measured(run):
     np.testing.assert_array_equal(metrics["eval/return"], [np.nan, 7, 9.25])
 
 
-def test_reads_a_file_as_well_as_a_folder(run):
+def test_a_file_is_read_like_its_folder(run):
     np.testing.assert_equal(read_metrics(run / "metrics.csv"), read_metrics(run))
 
 
-@pytest.mark.parametrize("torn", ["4", "40", "40,1", "40,1,2,3", '40,"', "\0\0\0", "40,1,2,300.2"])
-def test_leaves_out_a_torn_last_line(run, torn):
-    (run / "metrics.csv").write_text(METRICS + torn)
+@pytest.mark.parametrize(
+    "incomplete", ["4", "40", "40,1", "40,1,2,3", '40,"', "\0\0\0", "40,1,2,300.2"]
+)
+def test_an_incomplete_last_line_is_skipped(run, incomplete):
+    (run / "metrics.csv").write_text(METRICS + incomplete)
     np.testing.assert_array_equal(read_metrics(run)["step"], [10, 20, 30])
 
 
 @pytest.mark.parametrize("text", ["", "st", "step\n", "step,eval/return\n"])
-def test_a_run_that_has_measured_nothing(run, text):
+def test_a_run_without_rows_has_an_empty_curve(run, text):
     (run / "metrics.csv").write_text(text)
     assert len(read_metrics(run)["step"]) == 0
     assert len(curve(run, "eval/return").steps) == 0
 
 
 @pytest.mark.parametrize("text", [METRICS + "40,1\n", METRICS + "40,a,2,3\n", "frame,x\n1,2\n"])
-def test_what_is_no_file_of_metrics_is_named(run, text):
+def test_a_malformed_file_is_reported(run, text):
     (run / "metrics.csv").write_text(text)
     with pytest.raises(MerlError, match=r"metrics\.csv is not a file of metrics"):
         read_metrics(run)
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_a_missing_file_is_reported(tmp_path):
     with pytest.raises(MerlError, match=r"no metrics in .*metrics\.csv"):
         read_metrics(tmp_path)
 
 
-def test_a_curve_has_no_gaps(run):
+def test_a_curve_skips_empty_cells(run):
     steps, values = curve(run, "eval/return")
     np.testing.assert_array_equal(steps, [20, 30])
     np.testing.assert_array_equal(values, [7, 9.25])
@@ -95,7 +97,7 @@ def test_aggregate_with_a_bootstrap_band():
 
 
 @pytest.mark.parametrize("curves", [[], [line([], [])], [line([0, 1], [0, 1]), line([2], [0])]])
-def test_aggregate_refuses_what_has_no_step_in_common(curves):
+def test_aggregate_refuses_curves_without_a_common_step(curves):
     with pytest.raises(ValueError, match="seeds"):
         aggregate(curves)
 

@@ -16,7 +16,7 @@ HEADER = (
 
 
 def write_run(run, steps, offset=0.0):
-    """A run with a training episode at every step and an evaluation at every second one."""
+    """Write metrics with a training episode at every step and an evaluation at every second one."""
     run.mkdir(exist_ok=True)
     lines = [HEADER]
     for i, step in enumerate(steps):
@@ -31,17 +31,17 @@ def write_run(run, steps, offset=0.0):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures that were saved, to look into."""
-    seen = []
+    """Collect the figures that are saved."""
+    saved = []
     save = figures.save
     monkeypatch.setattr(
-        figures, "save", lambda figure, to: (seen.append(figure), save(figure, to))[1]
+        figures, "save", lambda figure, to: (saved.append(figure), save(figure, to))[1]
     )
-    return seen
+    return saved
 
 
 def words(figure):
-    """Everything that is written on a figure, and where, in pixels."""
+    """Return {text on a figure: its box in pixels}; the title has no box."""
     figure.draw_without_rendering()
     found = {figure.get_suptitle(): None}
     for axes in figure.axes:
@@ -50,15 +50,14 @@ def words(figure):
     return found
 
 
-def test_one_run(tmp_path, drawn):
+def test_learning_curve_of_one_run(tmp_path, drawn):
     run = write_run(tmp_path / "run", range(1000, 61_000, 1000))
     path = learning_curve(
         run, tmp_path / "a" / "curve.png", references={"random": 2.1, "best known": 224.6}
     )
     assert imread(path).shape[:2] == (864, 1216)
     assert [one.name for one in path.parent.iterdir()] == ["curve.png"]
-    said = words(drawn[0])
-    assert set(said) == {
+    assert set(words(drawn[0])) == {
         "reach_duplo · laptop · seed 3",
         "random 2.1",
         "best known 225",
@@ -93,16 +92,16 @@ def test_labels_are_whole_and_do_not_overlap(tmp_path, drawn):
 
 
 @pytest.mark.parametrize(
-    ("steps", "said"),
+    ("steps", "title_end"),
     [([], "(no episode has ended yet)"), ([250], "(no evaluation yet)"), ([250, 500], "seed 3")],
 )
-def test_a_run_that_has_only_begun(tmp_path, drawn, steps, said):
+def test_the_title_says_if_there_is_no_evaluation_yet(tmp_path, drawn, steps, title_end):
     run = write_run(tmp_path / "run", steps)
     assert imread(learning_curve(run, tmp_path / "curve.png")).std() > 0
-    assert drawn[0].get_suptitle().endswith(said)
+    assert drawn[0].get_suptitle().endswith(title_end)
 
 
-def test_a_run_without_config_evaluation_columns_or_clock(tmp_path, drawn):
+def test_a_run_without_config_evaluations_or_times(tmp_path, drawn):
     (tmp_path / "metrics.csv").write_text("step,train/return\n250,3\n500,4\n")
     learning_curve(tmp_path, tmp_path / "curve.svg")
     assert drawn[0].get_suptitle() == f"{tmp_path.name} (no evaluation yet)"
@@ -111,7 +110,7 @@ def test_a_run_without_config_evaluation_columns_or_clock(tmp_path, drawn):
 
 
 @pytest.mark.parametrize("config", ["", "[1]", "{", '{"task": "reach_duplo"}'])
-def test_a_config_may_say_little(tmp_path, drawn, config):
+def test_an_incomplete_config_is_accepted(tmp_path, drawn, config):
     run = write_run(tmp_path / "run", [250, 500])
     (run / "config.json").write_text(config)
     learning_curve(run, tmp_path / "curve.png")
@@ -126,7 +125,7 @@ def test_long_training_is_drawn_as_means():
     np.testing.assert_allclose(steps.values[:2], [0.4, 0.6])
 
 
-def test_the_clock_along_the_top_follows_uneven_time(tmp_path, drawn):
+def test_the_time_axis_follows_uneven_speed(tmp_path, drawn):
     # 1000 steps in the first two minutes, 3000 in the next two.
     text = "step,time/seconds,eval/return\n500,60,1\n1000,120,1\n4000,240,1\n"
     (tmp_path / "metrics.csv").write_text(text)
@@ -137,7 +136,7 @@ def test_the_clock_along_the_top_follows_uneven_time(tmp_path, drawn):
     assert ticks == {"0": 0, "1": 500, "2": 1000, "3": 2500, "4": 4000}
 
 
-def test_several_agents_say_how_many_seeds_each_has(tmp_path, drawn):
+def test_labels_have_the_number_of_seeds(tmp_path, drawn):
     steps = range(1000, 21_000, 1000)
     seeds = [write_run(tmp_path / f"s{i}", steps, offset=2.0 * i) for i in range(3)]
     one = seeds[0] / "metrics.csv"
@@ -152,7 +151,7 @@ def test_several_agents_say_how_many_seeds_each_has(tmp_path, drawn):
     assert (band.ymin, band.ymax) == (2, 24)
 
 
-def test_over_minutes_in_percent_with_references(tmp_path, drawn):
+def test_success_over_minutes_with_references(tmp_path, drawn):
     run = write_run(tmp_path / "run", range(1000, 21_000, 1000))
     published = Curve(np.array([1.0, 9.0]), np.array([0.1, 0.9]))
     learning_curves(
@@ -176,15 +175,15 @@ def test_seeds_without_a_common_step_have_no_mean(tmp_path, drawn):
     assert len(drawn[0].axes[0].lines) == 2
 
 
-def test_what_cannot_be_drawn_is_one_clear_line(tmp_path):
+def test_errors_name_the_missing_data(tmp_path):
     run = write_run(tmp_path / "run", [250])
-    for runs, said in (
+    for runs, message in (
         ({}, "no run"),
         ({"MERL": []}, "MERL: no run"),
         ({"MERL": [run]}, "MERL: no eval/return over steps"),
         ({"MERL": [tmp_path / "none"]}, "no metrics"),
     ):
-        with pytest.raises(MerlError, match=said):
+        with pytest.raises(MerlError, match=message):
             learning_curves(runs, tmp_path / "curves.png")
     with pytest.raises(MerlError, match="cannot be written"):
         learning_curve(run, tmp_path / "curve.abc")
@@ -193,13 +192,13 @@ def test_what_cannot_be_drawn_is_one_clear_line(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_panel_for_each_run_and_a_curve_for_each_term(tmp_path, drawn):
+def test_reward_terms_have_a_panel_per_run_and_a_curve_per_term(tmp_path, drawn):
     rows = ["step,eval/return,eval/reward/reaching,eval/reward/pushing\n"]
     rows += [f"{1000 * i},{3 * i},{2 * i},{i}\n" for i in range(1, 31)]
     (tmp_path / "metrics.csv").write_text("".join(rows))
-    beside = {"second": {"reaching": 40.0}}
+    references = {"second": {"reaching": 40.0}}
     path = reward_terms(
-        {"first": tmp_path, "second": tmp_path}, tmp_path / "terms.png", references=beside
+        {"first": tmp_path, "second": tmp_path}, tmp_path / "terms.png", references=references
     )
     assert path.is_file()
     first, second = drawn[0].axes
@@ -208,7 +207,7 @@ def test_a_panel_for_each_run_and_a_curve_for_each_term(tmp_path, drawn):
     assert {"reaching 60", "pushing 30"} <= set(words(drawn[0]))
 
 
-def test_a_run_without_terms_has_nothing_to_draw(tmp_path):
+def test_reward_terms_refuses_a_run_without_terms(tmp_path):
     (tmp_path / "metrics.csv").write_text("step,eval/return\n1000,2.0\n")
     with pytest.raises(MerlError, match=r"mine: .* has no terms of a reward"):
         reward_terms({"mine": tmp_path}, tmp_path / "terms.png")

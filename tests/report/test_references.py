@@ -1,4 +1,4 @@
-"""What returns are compared with."""
+"""The reference returns of the tasks."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from merl.envs.config import EnvConfig
 from merl.report.references import references
 
 
-def test_every_task_has_a_floor_and_a_ceiling():
+def test_every_task_has_random_actions_no_motion_and_an_expert():
     for task, form in [
         ("reach_duplo", EnvConfig()),
         ("move_box", EnvConfig()),
@@ -29,18 +29,18 @@ def test_every_task_has_a_floor_and_a_ceiling():
         assert still.success_end.mean < 0.05
 
 
-def test_what_is_published_says_where():
+def test_published_references_name_their_source():
     published = references("reach_duplo")[-1]
     assert (published.name, published.returns.mean) == ("best known: DrQ-v2", 224.6)
     assert "published" in published.source
 
 
-def test_a_task_of_ones_own_has_none():
+def test_a_user_task_has_no_references():
     assert references("my_package:make_env") == ()
 
 
 @pytest.mark.parametrize(
     "form", [EnvConfig(start=("around",)), EnvConfig(occluded=True, reward="staged")]
 )
-def test_a_form_that_was_not_measured_has_none(form):
+def test_an_unmeasured_form_has_no_references(form):
     assert references("move_box", form) == ()

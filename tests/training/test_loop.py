@@ -87,7 +87,14 @@ def stopped_after(update: int, parts: Parts) -> StepResult:
         stop = stop or parts.progress.updates == update
         return whole()
 
-    arguments = parts.collector, parts.agent, stopping, parts.progress, parts.randomness, parts.config
+    arguments = (
+        parts.collector,
+        parts.agent,
+        stopping,
+        parts.progress,
+        parts.randomness,
+        parts.config,
+    )
     for moment in train(*arguments, lambda: stop):
         if stop:
             return moment
@@ -148,7 +155,13 @@ def test_who_is_stopped_in_what_was_left_takes_no_step() -> None:
     assert stopped_after(67, parts).updates == 68
     assert parts.progress.step == 30
     stopping = train(
-        parts.collector, parts.agent, parts.update, parts.progress, parts.randomness, MANY, lambda: True
+        parts.collector,
+        parts.agent,
+        parts.update,
+        parts.progress,
+        parts.randomness,
+        MANY,
+        lambda: True,
     )
     assert next(stopping).step == 30
     assert parts.progress.updates == 68

@@ -1,4 +1,4 @@
-"""Benches: the speed of merl's parts beside references."""
+"""Benches: the speed of merl's parts compared with references."""
 
 from __future__ import annotations
 

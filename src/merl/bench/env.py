@@ -1,4 +1,4 @@
-"""Speed of the environment beside dm_control's own, with the same task and image.
+"""Speed of the environment compared with dm_control's own, with the same task and image.
 
 The variants take turns within one run, so that other load on the machine affects all of them.
 Results are medians over the rounds; ratios are taken within each round.

@@ -165,7 +165,7 @@ class _Loop:
 
     def rate(self, steps: int) -> float:
         """Run at least `steps` further steps; return the steps per second."""
-        first, begun = self._progress.step, time.perf_counter()
+        first, start = self._progress.step, time.perf_counter()
         while self._progress.step < first + steps:
             next(self._results)
-        return (self._progress.step - first) / (time.perf_counter() - begun)
+        return (self._progress.step - first) / (time.perf_counter() - start)

@@ -1,4 +1,4 @@
-"""Speed of an update beside the same update in plain PyTorch (`merl.bench.plain`).
+"""Speed of an update compared with the same update in plain PyTorch (`merl.bench.plain`).
 
 Both have the same work: 84x84 images, three frames, proprioception of size 24, actions of size 9,
 batch 256; MERL with heads of six layers, as in the paper for `move_box` and `lift_box`, and DrQ-v2.

@@ -32,7 +32,7 @@ COMMANDS = {
     "evaluate": ("merl.cli.evaluate", "evaluate", "evaluate a trained policy, record a video"),
     "tasks": ("merl.cli.tasks", "tasks", "list the tasks"),
     "info": ("merl.cli.info", "info", "show versions, hardware and measured speed"),
-    "bench": ("merl.cli.bench", "bench", "measure merl's speed beside a reference"),
+    "bench": ("merl.cli.bench", "bench", "compare merl's speed with a reference"),
 }
 
 

@@ -11,7 +11,7 @@ from merl.core import MerlError, suggest
 
 
 def bench(args: list[str]) -> int:
-    """Time merl beside a reference, and print a table: merl bench env."""
+    """Time merl and a reference, and print a table: merl bench env."""
     if not args or args[0] in ("-h", "--help"):
         print(f"usage: merl bench {{{','.join(BENCHES)}}} [--repeats N] [--json FILE]")
         return 0

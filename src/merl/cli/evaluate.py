@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -16,8 +15,6 @@ from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.envs.config import RendererName
 from merl.evaluation.evaluation import EVALUATION_SEED, load_policy
-from merl.evaluation.evaluation import evaluate as evaluate_policy
-from merl.evaluation.video import MIN_SIDE
 from merl.report.references import references
 from merl.runs.run import Run
 from merl.training.live_view import describe
@@ -64,29 +61,16 @@ def evaluate(args: list[str]) -> int:
     json_file, video_file = _absolute(options.json), _absolute(options.video)
     console = make_console()
     policy = load_policy(options.run, checkpoint=options.checkpoint)
-    changes: dict[str, Any] = {} if options.renderer is None else {"renderer": options.renderer}
-    if options.video is not None:
-        size = max(policy.config.env.render_size, MIN_SIDE)
-        changes |= {"render_mode": "rgb_array", "render_size": size}
     if options.trust:
         tell_trusted(Run.open(options.run))
-    env = policy.make_env(trust=options.trust, **changes)
+    result = policy.evaluate(
+        episodes=options.episodes,
+        video=video_file,
+        renderer=options.renderer,
+        max_episode_steps=options.max_episode_steps,
+        trust=options.trust,
+    )
     config = policy.config
-    if options.max_episode_steps is not None:
-        limited = dataclasses.replace(config.eval, max_episode_steps=options.max_episode_steps)
-        config = dataclasses.replace(config, eval=limited)
-    try:
-        result = evaluate_policy(
-            policy,
-            env,
-            options.episodes,
-            reset=policy.reset,
-            video=video_file,
-            max_steps=config.eval_steps,
-            reports_success=policy.reports_success,
-        )
-    finally:
-        env.close()
     renderer = options.renderer or policy.config.env.renderer
     images = "" if policy.config.own_env else f", {renderer} images"
     line = f"{options.run} at step {policy.step:,}{images}: {describe(result)}"

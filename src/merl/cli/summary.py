@@ -1,4 +1,4 @@
-"""The summary of a run: its return beside references, its learning curve and its video."""
+"""The summary of a run: its return compared with references, its learning curve and its video."""
 
 from __future__ import annotations
 

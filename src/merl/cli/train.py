@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, cast
 
-import torch
 import tyro
 
 from merl.cli.parsing import parse
 from merl.cli.running import begin, go_on
 from merl.config import Setting, TrainConfig
 from merl.core import CONFIG_FILE, MerlError
-from merl.experiments.presets import PRESETS, compose
+from merl.experiments.presets import PRESETS, compose, default_preset
 from merl.runs.resume import decided, left_open
 from merl.runs.run import Run
 
@@ -72,9 +71,8 @@ def _choose_preset(args: list[str]) -> tuple[str, str]:
     name = _given(args, "--preset")
     if name is not None:
         return name, "as requested"
-    if torch.cuda.is_available():
-        return "paper", "CUDA is available"
-    return "laptop", "CUDA is not available"
+    name = default_preset()
+    return name, "CUDA is available" if name == "paper" else "CUDA is not available"
 
 
 def _given(args: list[str], flag: str) -> str | None:

@@ -27,6 +27,7 @@ from merl.core.guards import check_finite
 from merl.core.statistics import Interval, bootstrap_interval, wilson_interval
 from merl.envs.user_spaces import Modality
 from merl.evaluation.recording import EpisodeVideo, warn_user
+from merl.evaluation.video import MIN_SIDE
 from merl.runs.checkpoint import Checkpoint, load_networks, readable
 from merl.runs.run import Run
 
@@ -128,6 +129,51 @@ class Policy:
                 env.close()
                 raise
         return env
+
+    def evaluate(
+        self,
+        *,
+        episodes: int = 10,
+        video: Path | None = None,
+        renderer: str | None = None,
+        max_episode_steps: int | None = None,
+        trust: bool = False,
+    ) -> Evaluation:
+        """Run episodes without noise, from the evaluation's fixed start states.
+
+        Args:
+            episodes: number of episodes, at least 1.
+            video: record the first episode into this MP4 file.
+            renderer: draws the images; None: the renderer of the training.
+            max_episode_steps: limit in steps for episodes that do not end earlier; None: as in the
+                run.
+            trust: see `make_env`.
+
+        Raises:
+            MerlError: the environment cannot be made or failed, or the video cannot be written.
+            NotFinite: a reward or an observation is NaN or infinite.
+        """
+        changes: dict[str, Any] = {} if renderer is None else {"renderer": renderer}
+        if video is not None:
+            size = max(self.config.env.render_size, MIN_SIDE)
+            changes |= {"render_mode": "rgb_array", "render_size": size}
+        limits = self.config.eval
+        if max_episode_steps is not None:
+            limits = dataclasses.replace(limits, max_episode_steps=max_episode_steps)
+        config = dataclasses.replace(self.config, eval=limits)
+        env = self.make_env(trust=trust, **changes)
+        try:
+            return evaluate(
+                self,
+                env,
+                episodes,
+                reset=self.reset,
+                video=video,
+                max_steps=config.eval_steps,
+                reports_success=self.reports_success,
+            )
+        finally:
+            env.close()
 
     def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
         if not isinstance(observation, Mapping):

@@ -271,7 +271,7 @@ def test_an_inexact_resume_is_reported(
     tmp_path: Path, which: str, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train(tmp_path / "run", which, *flags) == 0
-    reported = "a resumed run will meet other episodes" in flat(capsys.readouterr().out)
+    reported = "a resumed run will have other episodes" in flat(capsys.readouterr().out)
     assert reported == (which == "own_generator")
 
 

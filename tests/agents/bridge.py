@@ -1,4 +1,4 @@
-"""Between the package and the reference: a case, its agent, its chance, and both vocabularies."""
+"""Test cases, their data, and the conversion of names and states from package to reference."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ GAMMA = 0.99
 
 @dataclass(frozen=True)
 class Case:
-    """What is learnt from: the modalities' shapes, and how MERL is configured."""
+    """A test case: config of the agent, shapes of the modalities, batch size, environment step."""
 
     name: str
     config: AgentConfig
@@ -47,7 +47,7 @@ class Case:
 
     @property
     def spec(self) -> reference.Spec:
-        """The config in the reference's words."""
+        """The config as the reference's `Spec`."""
         c = self.config
         fusion = ("psi_critic",) if c.target == "heads_and_fusion" else ()
         return reference.Spec(
@@ -73,7 +73,7 @@ class Case:
         )
 
     def agent(self, seed: int = 0, actions: int = ACTIONS) -> DDPG:
-        """As the package makes it."""
+        """Make the agent with the package."""
         agent = make_agent(
             self.config,
             self.observation_space,
@@ -86,12 +86,12 @@ class Case:
         return agent
 
     def batch_of(self, seed: int, dtype: torch.dtype = torch.float32) -> Batch:
-        """Pictures that are smooth but for their grain, and discounts of both kinds."""
+        """Return a random batch, with discounts of zero and above zero."""
         rng = np.random.default_rng(seed)
 
         def observation() -> dict[str, Tensor]:
             images = {
-                k: torch.from_numpy(_pictures(rng, (self.batch, STACK, *shape)))
+                k: torch.from_numpy(_images(rng, (self.batch, STACK, *shape)))
                 for k, shape in self.images.items()
             }
             vectors = {
@@ -100,7 +100,7 @@ class Case:
             }
             return images | vectors
 
-        steps = rng.integers(1, 4, self.batch)  # m, less than n = 3 where an episode is over sooner
+        steps = rng.integers(1, 4, self.batch)  # m, less than n = 3 where an episode ends sooner
         discount = np.where(np.arange(self.batch) % 3 == 0, 0.0, GAMMA**steps)
         return Batch(
             observation=observation(),
@@ -130,7 +130,7 @@ def named_cases(*cases: Case) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
 
 
-def _pictures(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+def _images(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     brightness = rng.uniform(40, 215, (*shape[:2], 1, 1, shape[-1]))
     return np.clip(brightness + rng.normal(0, 30, shape), 0, 255).astype(np.uint8)
 
@@ -139,11 +139,11 @@ def _tensor(values: np.ndarray, dtype: torch.dtype) -> Tensor:
     return torch.from_numpy(values.astype(np.float32)).to(dtype)
 
 
-# -- the package's state, made as awkward as a state in mid-training -----------------------------
+# -- the package's state, made as general as in mid-training ------------------------------------
 
 
 def double(agent: DDPG) -> DDPG:
-    """The same agent in float64, Adam's moments included."""
+    """Convert the agent to float64, including Adam's moments."""
     agent.networks.double()
     agent.critic_target.double()
     for optimizer in (agent.critic_optimizer, agent.actor_optimizer):
@@ -154,7 +154,7 @@ def double(agent: DDPG) -> DDPG:
 
 @torch.no_grad()
 def weather(agent: DDPG, seed: int = 0) -> None:
-    """Biases and norms away from 0 and 1, a target unlike the critic, actions at the clamp."""
+    """Perturb biases and norms (not 0 and 1), target (not the critic), actions (to the clamp)."""
     generator = torch.Generator().manual_seed(seed)
     for module in (agent.networks, agent.critic_target):
         for p in module.parameters():
@@ -164,12 +164,12 @@ def weather(agent: DDPG, seed: int = 0) -> None:
 
 
 @torch.no_grad()
-def warm(agent: DDPG, steps: int = 7, seed: int = 0) -> None:
-    """Give Adam a past: second moments over many decades, so that its epsilon counts too."""
+def fill_adam_state(agent: DDPG, steps: int = 7, seed: int = 0) -> None:
+    """Set Adam's state; the second moments span many decades, so that epsilon matters too."""
     generator = torch.Generator().manual_seed(seed)
     for optimizer in (agent.critic_optimizer, agent.actor_optimizer):
         for p in [p for group in optimizer.param_groups for p in group["params"]]:
-            # In the memory order of the parameter: a fused Adam walks them side by side.
+            # In the memory order of the parameter: a fused Adam reads both as raw memory.
             m, v = torch.empty_like(p), torch.empty_like(p)
             v.copy_(10 ** (-16 + 14 * torch.rand(p.shape, generator=generator)))
             m.copy_(v.sqrt() * torch.randn(p.shape, generator=generator))
@@ -177,7 +177,7 @@ def warm(agent: DDPG, steps: int = 7, seed: int = 0) -> None:
             optimizer.state[p] = {"step": step, "exp_avg": m, "exp_avg_sq": v}
 
 
-# -- from the package's words to the reference's -------------------------------------------------
+# -- from the package's names to the reference's -------------------------------------------------
 
 _NAMES = [
     (
@@ -194,16 +194,18 @@ _NAMES = [
 ]
 
 
-def word(name: str) -> str:
-    for pattern, paper in _NAMES:
-        name = re.sub(pattern, paper, name)
+def reference_name(name: str) -> str:
+    for pattern, replacement in _NAMES:
+        name = re.sub(pattern, replacement, name)
     return name
 
 
 def named(agent: DDPG) -> dict[str, nn.Parameter]:
-    """Every parameter of the agent under the reference's name."""
-    networks = {word(name): p for name, p in agent.networks.named_parameters()}
-    averages = {f"bar_{word(name)}": p for name, p in agent.critic_target.named_parameters()}
+    """Return every parameter of the agent under the reference's name."""
+    networks = {reference_name(name): p for name, p in agent.networks.named_parameters()}
+    averages = {
+        f"bar_{reference_name(name)}": p for name, p in agent.critic_target.named_parameters()
+    }
     return networks | averages
 
 
@@ -216,17 +218,17 @@ def gradients_of(agent: DDPG) -> reference.Weights:
 
 
 def moments_of(optimizer: torch.optim.Optimizer, agent: DDPG) -> reference.Moments:
-    mine = {n: optimizer.state[p] for n, p in named(agent).items() if p in optimizer.state}
-    steps = {int(state["step"]) for state in mine.values()}
+    states = {n: optimizer.state[p] for n, p in named(agent).items() if p in optimizer.state}
+    steps = {int(state["step"]) for state in states.values()}
     return reference.Moments(
         t=steps.pop() if steps else 0,
-        m={n: state["exp_avg"].to(torch.float64, copy=True) for n, state in mine.items()},
-        v={n: state["exp_avg_sq"].to(torch.float64, copy=True) for n, state in mine.items()},
+        m={n: state["exp_avg"].to(torch.float64, copy=True) for n, state in states.items()},
+        v={n: state["exp_avg_sq"].to(torch.float64, copy=True) for n, state in states.items()},
     )
 
 
 def state_of(agent: DDPG) -> reference.State:
-    """The agent's state as the reference's, before or after its first update."""
+    """Return the agent's state as the reference's, before or after its first update."""
     weights = weights_of(agent)
     if not agent.critic_optimizer.state:
         return reference.start(weights, reference.Spec())
@@ -238,22 +240,22 @@ def state_of(agent: DDPG) -> reference.State:
 
 
 def sample_of(batch: Batch) -> reference.Sample:
-    def wide(x: Tensor) -> Tensor:
+    def to_double(x: Tensor) -> Tensor:
         return x if x.dtype == torch.uint8 else x.to(torch.float64)
 
     return reference.Sample(
-        o={k: wide(v) for k, v in batch.observation.items()},
-        a=wide(batch.action),
-        r=wide(batch.reward),
-        discount=wide(batch.discount),
-        o_next={k: wide(v) for k, v in batch.next_observation.items()},
+        o={k: to_double(v) for k, v in batch.observation.items()},
+        a=to_double(batch.action),
+        r=to_double(batch.reward),
+        discount=to_double(batch.discount),
+        o_next={k: to_double(v) for k, v in batch.next_observation.items()},
     )
 
 
 def draws_of(
     chance: reference.Chance, config: AgentConfig, dtype: torch.dtype, step: int = 0
 ) -> UpdateNoise:
-    """The package takes its noise scaled and clipped."""
+    """Convert to the package's update noise, which is scaled and clipped."""
 
     def clipped(noise: Tensor) -> Tensor:
         sigma, c = config.noise(step), config.noise_clip
@@ -267,11 +269,11 @@ def draws_of(
     )
 
 
-# -- how far apart -------------------------------------------------------------------------------
+# -- differences ---------------------------------------------------------------------------------
 
 
 def error(x: Tensor, truth: Tensor) -> float:
-    """|x - truth| / |truth|, of the whole tensor."""
+    """Return |x - truth| / |truth| of the whole tensor."""
     return float((x.to(torch.float64) - truth).norm() / truth.norm())
 
 
@@ -281,10 +283,10 @@ def errors(x: reference.Weights, truth: reference.Weights) -> dict[str, float]:
 
 
 def beyond(errors: Mapping[str, float], bound: float) -> dict[str, float]:
-    """Those at or over the bound; not-a-number is over any."""
+    """Return the errors at or over the bound; NaN is over any bound."""
     return {name: e for name, e in errors.items() if not e < bound}
 
 
 def snapshot(parameters: Iterator[nn.Parameter]) -> list[tuple[Tensor, Tensor | None]]:
-    """Values and gradients, to be compared bit for bit."""
+    """Return copies of values and gradients, for a bit-for-bit comparison."""
     return [(p.detach().clone(), None if p.grad is None else p.grad.clone()) for p in parameters]

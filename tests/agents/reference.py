@@ -1,11 +1,10 @@
-"""MERL's update, written a second time from the paper's equations, to hold the package against.
+"""Reference of MERL's update, written from the paper's equations, to test the package against.
 
-It shares nothing with the package: no layer, no optimizer, no helper. Every weight lives in one
-flat dict under the paper's symbol for it, every draw of chance is handed in, and one update is a
-pure function from a state to the next. Where the paper leaves a choice open, what was chosen is in
-`docs/paper.md`.
+It shares no code with the package: no layer, no optimizer, no helper. One flat dict holds every
+weight under its symbol in the paper, every random number is an argument, and one update is a pure
+function from a state to the next. `docs/paper.md` lists the choices that the paper leaves open.
 
-    symbol          what it is
+    symbol          meaning
     xi.KEY          image encoder f of one camera
     zeta.KEY        proprioception encoder g of one vector (no weights if it is the identity)
     psi_critic.KEY  multimodal fusion h for the critic, one modality
@@ -14,7 +13,7 @@ pure function from a state to the next. Where the paper leaves a choice open, wh
     phi_1, phi_2    critic Q
     bar_NAME        the exponential moving average of NAME
 
-The gradients come from autograd; everything forward, and Adam, is spelled out.
+The gradients come from autograd; the forward computation and Adam are written out.
 """
 
 from __future__ import annotations
@@ -32,17 +31,17 @@ Modalities = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Spec:
-    """What Table 1 and appendix C.1 fix; `averaged` names the weights that have an average."""
+    """Values from Table 1 and appendix C.1; `averaged` names the weights that have an average."""
 
     modalities: tuple[str, ...] = ("image", "proprio")  # in the order of concatenation
     strides: tuple[int, ...] = (2, 1, 1, 1)
     vector_layers: int = 0  # 0 is the identity, which the final version of MERL uses
-    layers: int = 3  # of the actor and of each Q, the output layer counted
+    layers: int = 3  # of the actor and of each Q, including the output layer
     head_norm: bool = True
-    fused: bool = True  # without, the heads see the encodings side by side
+    fused: bool = True  # if False, the heads receive the concatenated encodings
     fusion_norm: bool = True
-    shared: str = ""  # "" or whose loss moves the one fusion: "critic", "both"
-    critic_alone: tuple[str, ...] = ()  # modalities that the actor does not have
+    shared: str = ""  # "", or the losses that train the shared fusion: "critic", "both"
+    critic_alone: tuple[str, ...] = ()  # modalities that only the critic observes
     squash: str = "tanh"  # or "simnorm"
     simnorm_group: int = 8
     pad: int = 4
@@ -50,7 +49,7 @@ class Spec:
     clip: float = 0.3
     tau: float = 0.01
     learning_rate: float = 1e-4
-    bins: int = 0  # of a critic that learns a histogram (HL-Gauss); 0: the squared error
+    bins: int = 0  # bins of the critic's histogram (HL-Gauss); 0: squared error
     low: float = 0.0  # bounds of the targets
     high: float = 100.0
     averaged: tuple[str, ...] = ("phi_1", "phi_2")  # with "psi_critic" in front: DrQ-v2's target
@@ -63,13 +62,13 @@ class Sample:
     o: Modalities
     a: Tensor  # (B, A)
     r: Tensor  # (B,) the discounted sum of the rewards
-    discount: Tensor  # (B,) gamma^n, or what stands in its place at the end of an episode
+    discount: Tensor  # (B,) gamma^n, or another value at the end of an episode
     o_next: Modalities
 
 
 @dataclass(frozen=True)
 class Chance:
-    """Every random number of one update."""
+    """All random numbers of one update."""
 
     shift: dict[str, Tensor]  # (B, 2) per image key: row and column of the crop of o_t
     shift_next: dict[str, Tensor]  # the same for o_{t+n}
@@ -79,7 +78,7 @@ class Chance:
 
 @dataclass(frozen=True)
 class Moments:
-    """Adam's state: how many steps were made, and two moments of every gradient."""
+    """Adam's state: number of steps, and two moments of every gradient."""
 
     t: int
     m: Weights
@@ -88,7 +87,7 @@ class Moments:
 
 @dataclass(frozen=True)
 class State:
-    """Everything that the next update depends on, but for the sample and the chance."""
+    """Everything that the next update depends on, except sample and random numbers."""
 
     weights: Weights
     critic_adam: Moments
@@ -97,7 +96,7 @@ class State:
 
 @dataclass(frozen=True)
 class Report:
-    """What one update computed on the way."""
+    """Intermediate results of one update."""
 
     y: Tensor  # (B,)
     critic_loss: Tensor
@@ -128,13 +127,13 @@ def tanh(x: Tensor) -> Tensor:
 
 
 def simnorm(x: Tensor, group: int) -> Tensor:
-    """A softmax within every group of neighbours."""
+    """Apply a softmax within every group of neighbours."""
     e = x.unflatten(-1, (-1, group)).exp()  # (B, groups, group)
     return (e / e.sum(-1, keepdim=True)).flatten(-2)
 
 
 def clamp_straight_through(a: Tensor) -> Tensor:
-    """The value is clamped to [-1, 1]; the gradient is the identity's."""
+    """Clamp the value to [-1, 1], with the gradient of the identity."""
     with torch.no_grad():
         excess = a - torch.minimum(torch.maximum(a, -torch.ones_like(a)), torch.ones_like(a))
     return a - excess
@@ -144,9 +143,9 @@ def clamp_straight_through(a: Tensor) -> Tensor:
 
 
 def aug(image: Tensor, shift: Tensor, pad: int) -> Tensor:
-    """Pad each side with its edge's pixels and crop at `shift`, one crop for the whole stack.
+    """Pad each side with its edge pixels and crop at `shift`, one crop for the whole stack.
 
-    The crop's corner is a whole pixel, so the bilinear interpolation of section 4.1 is the pixel.
+    The offset is a whole pixel, so the bilinear interpolation of section 4.1 returns the pixel.
     """
     height, width = image.shape[-3:-1]  # (B, K, H, W, C)
     rows = torch.arange(-pad, height + pad).clamp(0, height - 1)
@@ -160,7 +159,7 @@ def aug(image: Tensor, shift: Tensor, pad: int) -> Tensor:
 
 
 def f(w: Weights, key: str, image: Tensor, spec: Spec) -> Tensor:
-    """C.1's image encoder: 3x3 convolutions, a ReLU after each. Pixels enter as 0..1 less 0.5."""
+    """C.1's image encoder: 3x3 convolutions with ReLU; pixels are scaled to 0..1, minus 0.5."""
     batch, frames, height, width, channels = image.shape
     x = image.to(w[f"xi.{key}.1.weight"].dtype) / 255 - 0.5
     x = x.permute(0, 1, 4, 2, 3).reshape(batch, frames * channels, height, width)
@@ -254,7 +253,7 @@ def histogram(y: Tensor, spec: Spec) -> Tensor:
 
 
 def target(w: Weights, sample: Sample, chance: Chance, spec: Spec) -> Tensor:
-    """y, below equation 1: the Q-heads are averages, everything that encodes is most recent."""
+    """y, below equation 1: the Q-heads are averages, encoders and fusion are the newest."""
     psi = "bar_psi_critic" if "psi_critic" in spec.averaged else "psi_critic"
     r_next = encode(w, sample.o_next, chance.shift_next, spec)
     a_next = pi(w, h(w, "psi_actor", r_next, spec), chance.noise_next, spec)
@@ -277,7 +276,7 @@ def critic_loss(w: Weights, r: Modalities, a: Tensor, y: Tensor, spec: Spec) -> 
 
 
 def actor_loss(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> Tensor:
-    """Equation 2; what the critic sees of o_t is a constant, also where its fusion learns here."""
+    """Equation 2; the critic's latent of o_t is constant, even if its fusion is trained here."""
     a = pi(w, h(w, "psi_actor", r, spec), noise, spec)
     r_mm = h(w, "psi_critic", r, spec).detach()
     return -torch.minimum(q(w, "phi_1", r_mm, a, spec), q(w, "phi_2", r_mm, a, spec)).mean()
@@ -290,17 +289,17 @@ ACTOR_LEARNS = ("psi_actor", "theta")
 
 
 def actor_learns(spec: Spec) -> tuple[str, ...]:
-    """What the actor's loss moves; a fusion that both use may be moved by both losses."""
+    """Return the symbols that the actor's loss trains; both losses may train a shared fusion."""
     return ("psi_critic", "theta") if spec.shared == "both" else ACTOR_LEARNS
 
 
 def of(weights: Iterable[str], symbols: Iterable[str]) -> list[str]:
-    """The names that belong to one of the paper's symbols."""
+    """Return the names that belong to one of these symbols."""
     return [name for name in weights if name.split(".")[0] in tuple(symbols)]
 
 
 def gradients(loss: Callable[[Weights], Tensor], w: Weights, names: list[str]) -> Weights:
-    """Of a loss with respect to the named weights, and only them."""
+    """Return the gradients of a loss with respect to the named weights only."""
     leaves = {name: w[name].detach().clone().requires_grad_() for name in names}
     return dict(
         zip(names, torch.autograd.grad(loss(w | leaves), list(leaves.values())), strict=True)
@@ -333,8 +332,8 @@ def average(w: Weights, spec: Spec) -> Weights:
 def update(state: State, sample: Sample, chance: Chance, spec: Spec) -> tuple[State, Report]:
     """UPDATECRITIC, then UPDATEACTOR on the same sample.
 
-    The actor sees the features of o_t from before the critic's step, as constants; the critic that
-    judges it, fusion and heads, is the one from after the step.
+    The actor uses the features of o_t from before the critic's step, as constants. Its loss uses
+    the critic's fusion and heads from after that step.
     """
     w = state.weights
     y = target(w, sample, chance, spec)
@@ -351,14 +350,14 @@ def update(state: State, sample: Sample, chance: Chance, spec: Spec) -> tuple[St
 
     loss_2, g_2 = eq_2(w), gradients(eq_2, w, of(w, actor_learns(spec)))
     w, actor_adam = adam(w, state.actor_adam, g_2, spec)
-    # Last, as in DrQ-v2: it matters only where the actor's loss moves what has an average.
+    # Last, as in DrQ-v2: it matters only if the actor's loss trains weights with an average.
     w = average(w, spec)
 
     return State(w, critic_adam, actor_adam), Report(y, loss_1, loss_2, g_1 | g_2)
 
 
 def start(weights: Weights, spec: Spec) -> State:
-    """Adam before its first step."""
+    """Return the state before the first step of Adam."""
 
     def zeros(symbols: tuple[str, ...]) -> Moments:
         names = of(weights, symbols)

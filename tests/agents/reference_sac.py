@@ -1,6 +1,6 @@
-"""SAC's update, written a second time from Haarnoja et al. (2018b), to hold the package against.
+"""Reference of SAC's update, written from Haarnoja et al. (2018b), to test the package against.
 
-Layers, Adam and vocabulary are those of `reference`; the equations are the paper's (section 5 and
+Layers, Adam and names are those of `reference`; the equations are the paper's (section 5 and
 appendix C): equation 5 for the critic, 9 for the actor, 18 for the temperature, and appendix C for
 the density of a squashed Gaussian.
 """
@@ -39,7 +39,7 @@ LEAST, GREATEST = -10.0, 2.0  # of log sigma
 
 @dataclass(frozen=True)
 class SoftState:
-    """The agent's state, and log alpha with its Adam."""
+    """State of the agent, log alpha, and the state of its Adam."""
 
     agent: State
     log_alpha: Tensor
@@ -48,7 +48,7 @@ class SoftState:
 
 @dataclass(frozen=True)
 class SoftReport:
-    """What one update computed on the way."""
+    """Intermediate results of one update."""
 
     y: Tensor
     critic_loss: Tensor
@@ -59,7 +59,7 @@ class SoftReport:
 
 
 def policy(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> tuple[Tensor, Tensor]:
-    """An action a = tanh(u), u = mu + sigma noise, and log pi(a | o), equation 26."""
+    """Return an action a = tanh(u), u = mu + sigma noise, and log pi(a | o), equation 26."""
     out = mlp(w, "theta", h(w, "psi_actor", r, spec), spec)
     half = out.shape[-1] // 2
     mu, raw = out[:, :half], out[:, half:]
@@ -73,7 +73,7 @@ def policy(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> tuple[Tensor
 def update(
     state: SoftState, sample: Sample, chance: Chance, spec: Spec, target_entropy: float
 ) -> tuple[SoftState, SoftReport]:
-    """Critic, target, actor on the features from before the critic's step, temperature."""
+    """Update critic, target, actor (on features from before the critic's step), temperature."""
     w = state.agent.weights
     alpha = state.log_alpha.exp()
     r_next = encode(w, sample.o_next, chance.shift_next, spec)

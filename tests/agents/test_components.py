@@ -34,14 +34,14 @@ def train(agent: DDPG, case: Case, updates: range) -> None:
         agent.update(case.batch_of(seed))
 
 
-# -- the actor learns in every n-th update ---------------------------------------------------------
+# -- the actor is updated in every n-th update ----------------------------------------------------
 
 
 @AGENTS
-def test_the_actor_learns_in_every_third_update(config: AgentConfig) -> None:
+def test_actor_is_updated_in_every_third_update(config: AgentConfig) -> None:
     case = case_of(config, actor_every=3)
     agent = case.agent()
-    moved: list[tuple[bool, bool]] = []
+    changed: list[tuple[bool, bool]] = []
     for seed in range(7):
         before = weights_of(agent)
         metrics = agent.update(case.batch_of(seed))
@@ -51,22 +51,22 @@ def test_the_actor_learns_in_every_third_update(config: AgentConfig) -> None:
             for name in ("theta.1.weight", "phi_1.1.weight")
         )
         assert ("actor_loss" in metrics) == actor
-        moved.append((actor, critic))
-    assert [critic for _, critic in moved] == [True] * 7
-    assert [actor for actor, _ in moved] == [False, False, True, False, False, True, False]
+        changed.append((actor, critic))
+    assert [critic for _, critic in changed] == [True] * 7
+    assert [actor for actor, _ in changed] == [False, False, True, False, False, True, False]
 
 
-def test_a_saved_agent_keeps_its_place_between_two_updates_of_the_actor() -> None:
+def test_saved_agent_keeps_the_count_of_updates() -> None:
     case = case_of(MERLConfig(latent_dim=16, **SMALL), actor_every=3)
     agent, resumed = case.agent(), case.agent(seed=9)
     train(agent, case, range(4))
     resumed.load_state_dict(through_a_file(agent.state_dict()))
     for each in (agent, resumed):
-        train(each, case, range(4, 6))  # the second of these moves the actor
+        train(each, case, range(4, 6))  # the second of these updates the actor
     assert same(agent, resumed)
 
 
-def test_a_checkpoint_without_a_count_of_updates_can_be_loaded() -> None:
+def test_state_without_a_count_of_updates_can_be_loaded() -> None:
     case = case_of(MERLConfig(latent_dim=16, **SMALL))
     state = case.agent().state_dict()
     del state["updates"]
@@ -88,15 +88,17 @@ AVERAGED = pytest.mark.parametrize(
 )
 
 
-def as_it_acts(agent: DDPG, weights: Mapping[str, Tensor], case: Case) -> Tensor:
-    """The action that these weights of its networks give."""
+def action_of(agent: DDPG, weights: Mapping[str, Tensor], case: Case) -> Tensor:
+    """Return the action of an agent with these weights."""
     twin = replace(case, config=replace(case.config, actor_average=None)).agent()
     twin.networks.load_state_dict(weights)
     return twin.act(case.batch_of(99).observation, explore=False)
 
 
 @AVERAGED
-def test_evaluation_acts_by_the_average_and_exploration_by_the_newest(config: AgentConfig) -> None:
+def test_evaluation_uses_the_average_and_exploration_the_newest_weights(
+    config: AgentConfig,
+) -> None:
     case = case_of(config, actor_average=0.25, learning_rate=1e-2, noise_std=0.0)
     agent = case.agent()
 
@@ -115,16 +117,16 @@ def test_evaluation_acts_by_the_average_and_exploration_by_the_newest(config: Ag
             if name.startswith((fusion, "actor."))
         }
     observation = case.batch_of(99).observation
-    calm = agent.act(observation, explore=False)
-    torch.testing.assert_close(calm, as_it_acts(agent, recent | averaged, case))
-    assert not torch.allclose(calm, as_it_acts(agent, recent, case), atol=1e-3)
-    if not isinstance(config, SACConfig):  # whose noise is the policy's own
+    deterministic = agent.act(observation, explore=False)
+    torch.testing.assert_close(deterministic, action_of(agent, recent | averaged, case))
+    assert not torch.allclose(deterministic, action_of(agent, recent, case), atol=1e-3)
+    if not isinstance(config, SACConfig):  # SAC's policy itself is random
         exploring = agent.act(observation, explore=True)
-        torch.testing.assert_close(exploring, as_it_acts(agent, recent, case))
+        torch.testing.assert_close(exploring, action_of(agent, recent, case))
 
 
 @AVERAGED
-def test_an_average_changes_nothing_of_what_is_learnt(config: AgentConfig) -> None:
+def test_average_does_not_change_learning(config: AgentConfig) -> None:
     plain, kept = (case_of(config, actor_average=share).agent() for share in (None, 0.1))
     case = case_of(config)
     for agent in (plain, kept):
@@ -133,7 +135,7 @@ def test_an_average_changes_nothing_of_what_is_learnt(config: AgentConfig) -> No
     assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
-def test_an_average_is_in_the_weights_that_a_checkpoint_holds(tmp_path: Path) -> None:
+def test_checkpoint_includes_the_average(tmp_path: Path) -> None:
     case = case_of(MERLConfig(latent_dim=16, **SMALL), actor_average=0.1, learning_rate=1e-2)
     agent, resumed, deployed = case.agent(), case.agent(seed=8), case.agent(seed=9)
     train(agent, case, range(3))
@@ -162,8 +164,10 @@ def test_an_average_is_in_the_weights_that_a_checkpoint_holds(tmp_path: Path) ->
     ids=["none", "hl_gauss", "all"],
 )
 @AGENTS
-def test_metrics_are_plain_numbers(config: AgentConfig, values: dict[str, object]) -> None:
-    """A metric with a gradient would keep the graphs of all updates in memory."""
+def test_metrics_are_scalars_without_gradient(
+    config: AgentConfig, values: dict[str, object]
+) -> None:
+    """A metric with a gradient would keep the graph of every update in memory."""
     if isinstance(config, SACConfig):
         values = {name: value for name, value in values.items() if name != "critic_loss"}
     case = case_of(config, **values)

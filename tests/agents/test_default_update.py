@@ -1,8 +1,8 @@
-"""Without optional components, weights are bit for bit those of the update written out here.
+"""Without optional components, weights equal bit for bit those of the update written out here.
 
-Recorded runs stay valid only as long as this holds. The update below is built from torch's
-operations and from layers alone, in the order that the first recorded runs had. It is the same on
-every processor, which a hash of the weights would not be.
+Recorded runs are valid only as long as this holds. The update below uses only torch's operations
+and layers, in the order of the first recorded runs. It is valid on every processor; a hash of the
+weights would not be.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CASES = [
 
 
 class WrittenOut:
-    """An agent's weights, and the update as a list of operations."""
+    """Weights of an agent, and its update as a list of operations."""
 
     def __init__(self, agent: DDPG) -> None:
         self.config = agent.config
@@ -111,7 +111,7 @@ class WrittenOut:
 
 
 class WrittenOutSAC(WrittenOut):
-    """With a Gaussian policy, and the temperature's step."""
+    """The same with a Gaussian policy, and with the step of the temperature."""
 
     def __init__(self, agent: SAC) -> None:
         super().__init__(agent)
@@ -148,7 +148,7 @@ class WrittenOutSAC(WrittenOut):
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @named_cases(*CASES)
-def test_five_updates_bit_for_bit(case: Case, precision: str) -> None:
+def test_five_updates_equal_bit_for_bit(case: Case, precision: str) -> None:
     case = replace(case, config=replace(case.config, precision=precision))
     agent = case.agent()
     sac = isinstance(agent, SAC)
@@ -168,8 +168,8 @@ def test_five_updates_bit_for_bit(case: Case, precision: str) -> None:
     assert [name for name in found if not torch.equal(found[name], truth[name])] == []
 
 
-def test_the_random_stream_of_the_first_weights() -> None:
-    """Whatever is drawn beside the weights must not move them: one of each network, to 1e-4."""
+def test_initial_weights_have_the_recorded_values() -> None:
+    """Other random draws must not change the weights: one weight of each network, to 1e-4."""
     weights = weights_of(CASES[0].agent())
     first = {name: float(weights[name].flatten()[0]) for name in NUMBERS}
     assert first == pytest.approx(NUMBERS, abs=1e-4)

@@ -1,4 +1,4 @@
-"""Same seed, same weights; what was saved goes on as if nothing had happened."""
+"""The same seed gives the same weights, and a saved agent resumes bit for bit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def same(a: DDPG, b: DDPG) -> bool:
 
 
 def through_a_file(state: dict[str, Any]) -> dict[str, Any]:
-    """As a checkpoint would: plain types only."""
+    """Save and load as a checkpoint does, with plain types only."""
     file = io.BytesIO()
     torch.save(state, file)
     file.seek(0)
@@ -43,7 +43,7 @@ def through_a_file(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def contiguous(state: Any) -> Any:
-    """Every tensor in the order of its shape, as formats without strides keep it."""
+    """Make every tensor contiguous, as file formats without strides do."""
     if isinstance(state, Tensor):
         return state.clone(memory_format=torch.contiguous_format)
     if isinstance(state, dict):
@@ -51,18 +51,18 @@ def contiguous(state: Any) -> Any:
     return [contiguous(value) for value in state] if isinstance(state, list) else state
 
 
-def test_the_same_seed_gives_the_same_weights() -> None:
+def test_same_seed_gives_the_same_weights() -> None:
     first, again, other = (trained(CASE.agent(seed), range(20)) for seed in (1, 1, 2))
     assert same(first, again)
     assert not same(first, other)
 
 
-def test_the_seed_is_of_the_weights_too() -> None:
+def test_seed_determines_initial_weights() -> None:
     assert same(CASE.agent(1), CASE.agent(1))
     assert not same(CASE.agent(1), CASE.agent(2))
 
 
-def test_the_seed_is_of_the_draws_too() -> None:
+def test_seed_determines_update_noise() -> None:
     first, again, other = (CASE.agent(seed).draw(CASE.batch) for seed in (1, 1, 2))
     assert torch.equal(first.next_noise, again.next_noise)
     assert torch.equal(first.shifts["image"], again.shifts["image"])
@@ -70,7 +70,7 @@ def test_the_seed_is_of_the_draws_too() -> None:
     assert not torch.equal(first.shifts["image"], other.shifts["image"])
 
 
-def check_it_goes_on(state: dict[str, Any], agent: DDPG) -> None:
+def check_resumes_bit_for_bit(state: dict[str, Any], agent: DDPG) -> None:
     resumed = CASE.agent(seed=99)
     resumed.load_state_dict(state)
     assert same(resumed, agent)
@@ -84,35 +84,35 @@ def check_it_goes_on(state: dict[str, Any], agent: DDPG) -> None:
         )
 
 
-def test_a_saved_agent_goes_on_bit_for_bit() -> None:
+def test_saved_agent_resumes_bit_for_bit() -> None:
     agent = trained(CASE.agent(), range(5))
-    check_it_goes_on(through_a_file(agent.state_dict()), agent)
+    check_resumes_bit_for_bit(through_a_file(agent.state_dict()), agent)
 
 
-def test_a_fresh_agent_can_be_saved() -> None:
+def test_untrained_agent_can_be_saved() -> None:
     agent = CASE.agent()
-    check_it_goes_on(through_a_file(agent.state_dict()), agent)
+    check_resumes_bit_for_bit(through_a_file(agent.state_dict()), agent)
 
 
-def test_the_memory_order_of_a_saved_tensor_does_not_matter() -> None:
-    """A fused Adam walks weights and moments side by side in memory, whatever their strides say."""
+def test_memory_order_of_a_saved_tensor_does_not_matter() -> None:
+    """A fused Adam reads weights and moments as raw memory and ignores their strides."""
     agent = trained(CASE.agent(), range(5))
-    check_it_goes_on(contiguous(through_a_file(agent.state_dict())), agent)
+    check_resumes_bit_for_bit(contiguous(through_a_file(agent.state_dict())), agent)
 
 
-def test_a_loaded_agent_shares_nothing_with_the_other() -> None:
+def test_loaded_agent_shares_no_memory_with_the_other() -> None:
     agent = trained(CASE.agent(), range(2))
     twin = CASE.agent(seed=99)
     twin.load_state_dict(agent.state_dict())
     trained(twin, range(2, 4))
-    undisturbed = trained(CASE.agent(), range(2))
-    for each in (agent, undisturbed):
+    expected = trained(CASE.agent(), range(2))
+    for each in (agent, expected):
         trained(each, range(4, 6))
-    assert same(agent, undisturbed)
+    assert same(agent, expected)
 
 
 @pytest.mark.parametrize("name", ["critic_optimizer", "actor_optimizer"])
-def test_the_moments_lie_as_the_weights_do(name: str) -> None:
+def test_moments_have_the_memory_order_of_the_weights(name: str) -> None:
     agent = trained(CASE.agent(), range(1))
     state = getattr(agent, name).state
     for p in [p for p in named(agent).values() if p in state]:

@@ -1,4 +1,4 @@
-"""MERL's declaration: Table 1, which senses it takes, and what it refuses."""
+"""MERL's config: Table 1, the modalities that it uses, and rejected values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def make(config: MERLConfig, space: spaces.Dict = SPACE) -> DDPG:
     return make_agent(config, space, action_space, frame_stack=3, seed=0, device=device)
 
 
-def test_table_1() -> None:
+def test_defaults_are_those_of_table_1() -> None:
     config = MERLConfig()
     assert config.learning_rate == 1e-4
     assert config.tau == 0.01
@@ -42,8 +42,8 @@ def test_table_1() -> None:
     assert (config.target, config.squash, config.vector_encoder_dim) == ("heads", "tanh", 0)
 
 
-def test_the_papers_networks() -> None:
-    """C.1 in numbers of weights."""
+def test_networks_have_as_many_weights_as_in_the_paper() -> None:
+    """Sizes are from C.1."""
 
     def size(module: torch.nn.Module) -> int:
         return sum(p.numel() for p in module.parameters())
@@ -61,7 +61,7 @@ def test_the_papers_networks() -> None:
     assert size(networks.critic) == 2 * one
 
 
-def test_every_modality_is_used_unless_others_are_named() -> None:
+def test_all_modalities_are_used_unless_keys_are_named() -> None:
     assert modalities(MERLConfig(), WITH_STATE) == (("image",), ("proprio", "state"))
     assert modalities(MERLConfig(vectors=("state",)), WITH_STATE) == (("image",), ("state",))
     assert modalities(MERLConfig(images=()), WITH_STATE) == ((), ("proprio", "state"))
@@ -69,14 +69,14 @@ def test_every_modality_is_used_unless_others_are_named() -> None:
     assert modalities(privileged_keys, WITH_STATE) == (("image",), ("proprio",))
 
 
-def test_what_does_not_split_evenly_is_rounded_down() -> None:
+def test_share_of_a_modality_is_rounded_down() -> None:
     networks = make(MERLConfig(latent_dim=127)).networks
     assert networks.critic_fusion.latent_dim == 126
     assert {p.out_features for p in networks.critic_fusion.projections.values()} == {63}
 
 
 @pytest.mark.parametrize(
-    ("config", "says"),
+    ("config", "message"),
     [
         ({"images": ("camera",)}, "names 'camera'"),
         ({"images": ("proprio",)}, "names 'proprio'"),
@@ -97,8 +97,10 @@ def test_what_does_not_split_evenly_is_rounded_down() -> None:
         ({"conv_strides": (4, 4, 4, 4)}, "84x84 pixels is too small"),
     ],
 )
-def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str) -> None:
-    with pytest.raises(MerlError, match=says):
+def test_config_that_does_not_fit_the_space_is_rejected(
+    config: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(MerlError, match=message):
         make(MERLConfig(**config), WITH_STATE if "privileged" in config else SPACE)
 
 
@@ -120,13 +122,13 @@ def test_what_the_space_cannot_give_is_refused(config: dict[str, Any], says: str
         ("actor_every", 0),
     ],
 )
-def test_a_bad_number_is_named(name: str, value: float) -> None:
+def test_error_names_the_invalid_number(name: str, value: float) -> None:
     with pytest.raises(MerlError, match=f"agent.{name.replace('_', '-')} must .* not {value}"):
         MERLConfig(**{name: value})
 
 
-def test_a_users_keys_may_be_called_anything() -> None:
-    """Torch's own dictionary of modules refuses dots and its own methods' names."""
+def test_observation_keys_may_have_any_name() -> None:
+    """Torch's `ModuleDict` rejects dots and the names of its own methods."""
     space = spaces.Dict(
         {
             "type": spaces.Box(0, 255, (16, 16, 3), np.uint8),

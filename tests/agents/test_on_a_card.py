@@ -1,7 +1,7 @@
-"""An update where tensors have no values: what asked for one would hold up a GPU, and raises here.
+"""An update never makes the host wait for a GPU, and never uses a tensor on another device.
 
-`meta` stands for the card: a tensor on another device raises, too, and so does a number that the
-host wants to see.
+The device `meta` stands for the GPU: its tensors have no values. So reading a value on the host
+raises an error, and so does a tensor on another device.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from merl.agents.update_noise import UpdateNoise
 from merl.bench.update import ACTIONS, learner_of, noise_batch
 from merl.networks import critic, encoders
 
-CARD = torch.device("meta")
+DEVICE = torch.device("meta")
 
 
 @pytest.fixture(autouse=True)
-def _card(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What torch refuses to do on `meta` at all is done as on a CPU."""
+def _device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace operations that torch does not support on `meta` by those of a CPU."""
 
     class OnHost(torch.Generator):
         def __new__(cls, device: object = None) -> torch.Generator:  # type: ignore[misc]
@@ -40,8 +40,8 @@ def _card(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def draws(size: int) -> UpdateNoise:
-    shifts = {"image": torch.zeros((size, 2), dtype=torch.int64, device=CARD)}
-    noise = torch.zeros((size, ACTIONS), device=CARD)
+    shifts = {"image": torch.zeros((size, 2), dtype=torch.int64, device=DEVICE)}
+    noise = torch.zeros((size, ACTIONS), device=DEVICE)
     return UpdateNoise(shifts, shifts, noise, noise)
 
 
@@ -54,20 +54,20 @@ def draws(size: int) -> UpdateNoise:
         ("merl", {"actor_average": 0.1}),
     ],
 )
-def test_an_update_asks_the_host_nothing(
+def test_update_does_not_wait_for_the_device(
     agent: str, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(AGENTS, agent, replace(AGENTS[agent], **values))
-    learner = learner_of(agent, "fp32", CARD)
-    batch = noise_batch(4).to(CARD)
+    learner = learner_of(agent, "fp32", DEVICE)
+    batch = noise_batch(4).to(DEVICE)
     for _ in range(2):
-        told = learner.learn(batch, draws(4))
-    assert {value.device for value in told.values()} == {CARD}
+        metrics = learner.learn(batch, draws(4))
+    assert {value.device for value in metrics.values()} == {DEVICE}
 
 
-def test_this_would_see_a_question(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = learner_of("merl", "fp32", CARD)
-    batch = noise_batch(4).to(CARD)
+def test_reading_a_value_or_another_device_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = learner_of("merl", "fp32", DEVICE)
+    batch = noise_batch(4).to(DEVICE)
     on_host = replace(batch, reward=torch.zeros(4))
     with pytest.raises(RuntimeError, match="meta"):
         learner.learn(on_host, draws(4))

@@ -1,4 +1,4 @@
-"""Which loss moves which weights: C.1's last sentences on each network, and Algorithm 1."""
+"""Weights that each loss trains: C.1's last sentences on each network, and Algorithm 1."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ACTORS = ("actor_fusion", "actor")
 
 
 def agent_in_training(target: str = "heads") -> DDPG:
-    """After one update, so that every network has a gradient to lose."""
+    """Make an agent and update it once, so that every network has a gradient."""
     agent = replace(CASE, config=replace(CONFIG, target=target)).agent()
     weather(agent)
     agent.update(CASE.batch_of(0))
@@ -46,7 +46,7 @@ def update_actor(agent: DDPG, *, detached: bool = True) -> None:
 
 
 def same(before: list, after: list) -> bool:
-    """Bit for bit, the values and the gradients."""
+    """Return whether values and gradients are equal bit for bit."""
     return all(
         torch.equal(p, q) and ((g is None and h is None) or torch.equal(g, h))
         for (p, g), (q, h) in zip(before, after, strict=True)
@@ -54,33 +54,39 @@ def same(before: list, after: list) -> bool:
 
 
 @pytest.mark.parametrize("detached", [True, False])
-def test_the_actors_loss_moves_actor_and_its_fusion_alone(detached: bool) -> None:
+def test_actor_loss_trains_only_actor_and_its_fusion(detached: bool) -> None:
     agent = agent_in_training()
-    still = [getattr(agent.networks, name) for name in CRITICS] + [agent.critic_target]
-    before = [snapshot(module.parameters()) for module in still]
-    moving = {
+    fixed = [getattr(agent.networks, name) for name in CRITICS] + [agent.critic_target]
+    before = [snapshot(module.parameters()) for module in fixed]
+    trained = {
         n: p.detach().clone() for n, p in named(agent).items() if n.startswith(("psi_a", "the"))
     }
     update_actor(agent, detached=detached)
-    assert all(map(same, before, [snapshot(module.parameters()) for module in still]))
-    assert moving
-    assert not any(torch.equal(p, named(agent)[name]) for name, p in moving.items())
+    assert all(map(same, before, [snapshot(module.parameters()) for module in fixed]))
+    assert trained
+    assert not any(torch.equal(p, named(agent)[name]) for name, p in trained.items())
 
 
-def test_the_critics_loss_moves_critic_its_fusion_and_the_encoders() -> None:
+def test_critic_loss_trains_critic_its_fusion_and_encoders() -> None:
     agent = agent_in_training()
-    still = [getattr(agent.networks, name) for name in ACTORS] + [agent.critic_target]
-    before = [snapshot(module.parameters()) for module in still]
+    fixed = [getattr(agent.networks, name) for name in ACTORS] + [agent.critic_target]
+    before = [snapshot(module.parameters()) for module in fixed]
     symbols = ("xi", "zeta", "psi_c", "phi")
-    moving = {n: p.detach().clone() for n, p in named(agent).items() if n.startswith(symbols)}
+    trained = {n: p.detach().clone() for n, p in named(agent).items() if n.startswith(symbols)}
     update_critic(agent)
-    assert all(map(same, before, [snapshot(module.parameters()) for module in still]))
-    assert {name.split(".")[0] for name in moving} == {"xi", "zeta", "psi_critic", "phi_1", "phi_2"}
-    assert not any(torch.equal(p, named(agent)[name]) for name, p in moving.items())
+    assert all(map(same, before, [snapshot(module.parameters()) for module in fixed]))
+    assert {name.split(".")[0] for name in trained} == {
+        "xi",
+        "zeta",
+        "psi_critic",
+        "phi_1",
+        "phi_2",
+    }
+    assert not any(torch.equal(p, named(agent)[name]) for name, p in trained.items())
 
 
 @BOTH_TARGETS
-def test_the_target_moves_by_tau(target: str) -> None:
+def test_target_moves_by_tau(target: str) -> None:
     agent = double(agent_in_training(target))
     tau, before = agent.config.tau, weights_of(agent)
     agent.update_target()
@@ -96,7 +102,7 @@ def test_the_target_moves_by_tau(target: str) -> None:
 
 
 @BOTH_TARGETS
-def test_one_update_moves_the_target_once(target: str) -> None:
+def test_update_moves_the_target_once(target: str) -> None:
     agent = double(agent_in_training(target))
     before = weights_of(agent)
     agent.learn(CASE.batch_of(2, torch.float64), draws_of(CASE.chance_of(2), CONFIG, torch.float64))
@@ -107,7 +113,7 @@ def test_one_update_moves_the_target_once(target: str) -> None:
         torch.testing.assert_close(after[name], expected, rtol=1e-13, atol=1e-15)
 
 
-def test_tau_of_one_copies() -> None:
+def test_tau_of_one_copies_the_critic() -> None:
     case = replace(CASE, config=replace(CONFIG, tau=1.0))
     agent = case.agent()
     weather(agent)
@@ -118,7 +124,7 @@ def test_tau_of_one_copies() -> None:
             torch.testing.assert_close(weights[name], weights[name.removeprefix("bar_")])
 
 
-def test_what_has_an_average() -> None:
+def test_networks_that_have_a_target() -> None:
     def averaged(target: str) -> set[str]:
         names = weights_of(agent_in_training(target))
         return {name.split(".")[0] for name in names if name.startswith("bar_")}
@@ -128,7 +134,7 @@ def test_what_has_an_average() -> None:
 
 
 @BOTH_TARGETS
-def test_the_average_begins_as_a_copy_and_learns_from_no_loss(target: str) -> None:
+def test_target_starts_as_a_copy_and_has_no_gradient(target: str) -> None:
     agent = replace(CASE, config=replace(CONFIG, target=target)).agent()
     weights = weights_of(agent)
     for name in weights:
@@ -139,12 +145,12 @@ def test_the_average_begins_as_a_copy_and_learns_from_no_loss(target: str) -> No
     assert all(p.grad is None for p in agent.critic_target.parameters())
 
 
-def test_every_network_is_learnt_by_one_optimizer() -> None:
+def test_each_weight_is_in_exactly_one_optimizer() -> None:
     agent = CASE.agent()
     groups = [
         [p for group in optimizer.param_groups for p in group["params"]]
         for optimizer in (agent.critic_optimizer, agent.actor_optimizer)
     ]
-    learnt = [id(p) for group in groups for p in group]
-    assert sorted(learnt) == sorted(id(p) for p in agent.networks.parameters())
-    assert len(set(learnt)) == len(learnt)
+    trained = [id(p) for group in groups for p in group]
+    assert sorted(trained) == sorted(id(p) for p in agent.networks.parameters())
+    assert len(set(trained)) == len(trained)

@@ -1,4 +1,4 @@
-"""SAC's update against the reference's, its policy against SciPy's, its temperature at its goal."""
+"""SAC's update against the reference, its policy against SciPy, its entropy at the target."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bridge import (
     double,
     error,
     errors,
+    fill_adam_state,
     gradients_of,
     moments_of,
     named_cases,
     sample_of,
     state_of,
-    warm,
     weather,
     weights_of,
 )
@@ -53,7 +53,7 @@ def prepared(case: Case) -> SAC:
     double(agent)
     agent.log_alpha.data = agent.log_alpha.data.double()
     weather(agent)
-    warm(agent)
+    fill_adam_state(agent)
     return agent
 
 
@@ -62,17 +62,17 @@ def draws_of(chance: reference_sac.Chance) -> UpdateNoise:
 
 
 @named_cases(*CASES)
-def test_losses_gradients_and_weights_of_five_updates(case: Case) -> None:
+def test_five_updates_equal_the_reference(case: Case) -> None:
     agent = prepared(case)
     zero = torch.zeros((), dtype=torch.float64)
     moments = reference_sac.Moments(0, {"log_alpha": zero}, {"log_alpha": zero})
     truth = reference_sac.SoftState(state_of(agent), agent.log_alpha.detach().clone(), moments)
-    goal = case.config.target_entropy or -agent.networks.actor.layers[-1].out_features / 2
+    target_entropy = case.config.target_entropy or -agent.networks.actor.layers[-1].out_features / 2
     for seed in range(5):
         chance, batch = case.chance_of(seed), case.batch_of(seed, torch.float64)
         metrics = agent.learn(batch, draws_of(chance))
         sample = sample_of(case.batch_of(seed))
-        truth, report = reference_sac.update(truth, sample, chance, case.spec, goal)
+        truth, report = reference_sac.update(truth, sample, chance, case.spec, target_entropy)
         for name in ("critic_loss", "actor_loss", "alpha_loss", "entropy"):
             assert error(metrics[name], getattr(report, name)) < 1e-8, name
         assert error(metrics["target_q"], report.y.mean()) < 1e-8
@@ -89,8 +89,8 @@ def test_losses_gradients_and_weights_of_five_updates(case: Case) -> None:
         assert not beyond(errors(moments_of(optimizer, agent).v, state.v), 1e-8)
 
 
-def test_the_density_is_that_of_a_squashed_gaussian() -> None:
-    """By the change of variables on a grid of one action: it integrates to one."""
+def test_log_prob_is_that_of_a_squashed_gaussian() -> None:
+    """Compare with the change of variables, on a grid of one action."""
     case = replace(CASES[0], batch=1)
     agent = prepared(case)
     encoded = agent.networks.encoders(case.batch_of(0, torch.float64).observation)
@@ -103,7 +103,7 @@ def test_the_density_is_that_of_a_squashed_gaussian() -> None:
         first.append(action[0, 0].item())
         log_probs.append(float(log_prob))
     rest = agent._sample(encoded, torch.zeros(1, 6, dtype=torch.float64))[1]
-    # log pi of the first action alone, up to the constant of the five that stand still
+    # density of the first action, up to the constant factor of the five fixed ones
     density = np.exp(np.array(log_probs) - float(rest))
     mean, log_std = agent.networks.actor(agent.networks.actor_latent(encoded))
     mu, sigma = float(mean[0, 0]), float(log_std.exp()[0, 0])
@@ -115,35 +115,35 @@ def test_the_density_is_that_of_a_squashed_gaussian() -> None:
     np.testing.assert_allclose(density[inside], (expected / center)[inside], rtol=1e-6)
 
 
-def test_exploring_samples_and_judging_takes_the_mean() -> None:
+def test_exploration_samples_and_evaluation_uses_the_mean() -> None:
     case = CASES[0]
     agent = case.agent()
     observation = case.batch_of(0).observation
-    calm = agent.act(observation, explore=False)
-    assert torch.equal(calm, agent.act(observation, explore=False))
-    wild = torch.stack([agent.act(observation, explore=True) for _ in range(2000)])
-    assert wild.abs().max() <= 1
+    deterministic = agent.act(observation, explore=False)
+    assert torch.equal(deterministic, agent.act(observation, explore=False))
+    sampled = torch.stack([agent.act(observation, explore=True) for _ in range(2000)])
+    assert sampled.abs().max() <= 1
     mean, log_std = agent.networks.actor(
         agent.networks.actor_latent(agent.networks.encoders(observation))
     )
-    assert torch.equal(calm, torch.tanh(mean))
-    u = torch.atanh(wild.double().clamp(-1 + 1e-12, 1 - 1e-12))
+    assert torch.equal(deterministic, torch.tanh(mean))
+    u = torch.atanh(sampled.double().clamp(-1 + 1e-12, 1 - 1e-12))
     assert u.mean(0) == pytest.approx(mean.double().detach(), abs=0.15)
     assert u.std(0) == pytest.approx(log_std.exp().double().detach(), rel=0.15)
 
 
 def one_step_batch(generator: torch.Generator, size: int = 64) -> Batch:
-    """A task of one step: what is done is paid -a^2 in the mean, and it is over."""
+    """Return a batch of a task with one step, in which action a has the reward -|a|^2."""
     state = {"state": torch.zeros(size, 1)}
     action = torch.rand(size, 2, generator=generator) * 2 - 1
     reward = -action.square().sum(-1)
     return Batch(state, action, reward, torch.zeros(size), state)
 
 
-@pytest.mark.parametrize("goal", [0.5, pytest.param(-2.0, marks=pytest.mark.long)])
-def test_the_temperature_settles_where_the_entropy_meets_its_target(goal: float) -> None:
+@pytest.mark.parametrize("target", [0.5, pytest.param(-2.0, marks=pytest.mark.long)])
+def test_temperature_brings_the_entropy_to_its_target(target: float) -> None:
     numbers = {"hidden_dim": 32, "learning_rate": 3e-3, "temperature": 0.05}
-    config = SACConfig(**numbers, target_entropy=goal, precision="fp32")
+    config = SACConfig(**numbers, target_entropy=target, precision="fp32")
     agent = Case("one", config, images={}, vectors={"state": 1}).agent(actions=2)
     generator = torch.Generator().manual_seed(0)
     seen = []
@@ -151,13 +151,13 @@ def test_the_temperature_settles_where_the_entropy_meets_its_target(goal: float)
         metrics = agent.update(one_step_batch(generator))
         seen.append([float(metrics[name]) for name in ("entropy", "alpha", "q")])
     entropy, alpha, _ = np.mean(seen[-300:], axis=0)
-    assert entropy == pytest.approx(goal, abs=0.15)
+    assert entropy == pytest.approx(target, abs=0.15)
     assert 1e-4 < alpha < 10
     spread = np.std([row[1] for row in seen[-300:]]) / alpha
-    assert spread < 0.5  # it has come to rest
+    assert spread < 0.5  # it has converged
 
 
-def test_it_goes_on_where_it_was_saved() -> None:
+def test_saved_agent_resumes_bit_for_bit() -> None:
     case = CASES[0]
     one, other = case.agent(), case.agent(seed=1)
     one.update(case.batch_of(0))
@@ -174,6 +174,6 @@ def test_it_goes_on_where_it_was_saved() -> None:
 @pytest.mark.parametrize(
     ("field", "value"), [("temperature", 0.0), ("target_entropy", float("nan"))]
 )
-def test_a_bad_number_is_named(field: str, value: float) -> None:
+def test_error_names_the_invalid_number(field: str, value: float) -> None:
     with pytest.raises(MerlError, match=f"agent.{field.replace('_', '-')} must"):
         SACConfig(**{field: value})

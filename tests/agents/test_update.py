@@ -1,4 +1,4 @@
-"""The package's update against the reference's: the same state, sample and chance give the same."""
+"""The package's update against the reference, from the same state, sample and random numbers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bridge import (
     draws_of,
     error,
     errors,
+    fill_adam_state,
     gradients_of,
     moments_of,
     named_cases,
     sample_of,
     state_of,
-    warm,
     weather,
     weights_of,
 )
@@ -59,12 +59,12 @@ CASES = [
         replace(SMALL, fusion="shared_by_both", target="heads_and_fusion", head_layers=4),
     ),
     Case(
-        "informed-critic",
+        "privileged-critic",
         replace(SMALL, privileged=("state",)),
         vectors={"proprio": 7, "state": 9},
     ),
     Case(
-        "noise-on-its-way-down",
+        "decreasing-noise",
         replace(SMALL, noise_std=1.0, noise_std_end=0.1, noise_steps=1000),
         step=400,
     ),
@@ -104,12 +104,12 @@ PAPER_3, PAPER_6 = (
 
 
 def prepared(case: Case, dtype: torch.dtype) -> DDPG:
-    """An agent in mid-training: nothing in it is zero, one, or equal to something else."""
+    """Make an agent as in mid-training: no weights are zero, one, or equal to each other."""
     agent = case.agent()
     if dtype == torch.float64:
         double(agent)
     weather(agent)
-    warm(agent)
+    fill_adam_state(agent)
     return agent
 
 
@@ -146,11 +146,11 @@ def check_in_double_precision(case: Case, updates: int) -> None:
 
 
 @named_cases(*CASES)
-def test_losses_gradients_and_weights_of_five_updates(case: Case) -> None:
+def test_five_updates_equal_the_reference(case: Case) -> None:
     check_in_double_precision(case, updates=5)
 
 
-def test_the_papers_size() -> None:
+def test_update_at_the_papers_size() -> None:
     check_in_double_precision(PAPER_3, updates=1)
 
 
@@ -160,7 +160,7 @@ def test_five_updates_at_the_papers_size(case: Case) -> None:
     check_in_double_precision(replace(case, batch=32), updates=5)
 
 
-def test_the_first_update_of_a_fresh_agent() -> None:
+def test_first_updates_of_an_untrained_agent() -> None:
     """Adam's bias correction is largest at its first step."""
     case = CASES[0]
     agent = double(case.agent())
@@ -172,22 +172,22 @@ def test_the_first_update_of_a_fresh_agent() -> None:
 
 
 @named_cases(*CASES)
-def test_single_precision(case: Case) -> None:
+def test_update_in_single_precision(case: Case) -> None:
     check_single_precision(case)
 
 
 @pytest.mark.long
 @named_cases(PAPER_3, PAPER_6)
-def test_single_precision_at_the_papers_size(case: Case) -> None:
-    """On few pictures, and two of three batches will do.
+def test_update_in_single_precision_at_the_papers_size(case: Case) -> None:
+    """Use few images, and require two of three batches to agree.
 
-    A ReLU whose input is 0 to within a rounding is open in one arithmetic and closed in the other,
-    which moves a gradient by 1e-4 to 1e-3. Of the 200,000 that a picture meets, one in some tens of
-    pictures does so; which, depends on the processor.
+    If the input of a ReLU is 0 within rounding, it can be active in one arithmetic and inactive in
+    the other, which changes a gradient by 1e-4 to 1e-3. An image passes 200,000 ReLUs; this happens
+    once in some tens of images, and depends on the processor.
     """
     few = replace(case, batch=2)
-    sound = [not beyond(single_precision_errors(few, seed), 1e-4) for seed in range(3)]
-    assert sum(sound) >= 2
+    agrees = [not beyond(single_precision_errors(few, seed), 1e-4) for seed in range(3)]
+    assert sum(agrees) >= 2
 
 
 def check_single_precision(case: Case) -> None:
@@ -195,7 +195,7 @@ def check_single_precision(case: Case) -> None:
 
 
 def single_precision_errors(case: Case, seed: int) -> dict[str, float]:
-    """Of the losses and the gradients of an update."""
+    """Return the errors of the losses and the gradients of an update."""
     agent = prepared(case, torch.float32)
     state = state_of(agent)
     metrics = learn(agent, case, seed, torch.float32)
@@ -211,7 +211,7 @@ TWINS_AT_ONCE = [case for case in CASES if case.name in ("six-layers", "without-
 
 
 @named_cases(*TWINS_AT_ONCE)
-def test_as_a_gpu_computes_the_twins(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_update_with_twins_at_once_as_on_a_gpu(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(TwinCritic, "at_once", True)
     check_in_double_precision(case, updates=5)
     check_single_precision(case)
@@ -219,8 +219,8 @@ def test_as_a_gpu_computes_the_twins(case: Case, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.long
 @pytest.mark.parametrize("as_on_a_gpu", [False, True])
-def test_compiled(as_on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes a minute, and a C++ compiler."""
+def test_update_compiled(as_on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This test takes a minute and needs a C++ compiler."""
     case = replace(CASES[0], config=replace(SMALL, torch_compile="yes"))
     if as_on_a_gpu:
 
@@ -234,7 +234,7 @@ def test_compiled(as_on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(augmentation, "_centred", augmentation._centred_at_once)
     check_in_double_precision(case, updates=5)
     assert case.agent().networks.critic._compiled_call_impl is not None
-    # In bf16 it rounds elsewhere, but where eager mode computes in single precision, so does it.
+    # In bf16, compiled code rounds elsewhere, but uses fp32 where eager mode does.
     gradients = []
     for compiled in ("no", "yes"):
         config = replace(SMALL, torch_compile=compiled, precision="bf16")
@@ -245,10 +245,10 @@ def test_compiled(as_on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @named_cases(*CASES)
-def test_bf16(case: Case) -> None:
-    """Losses to 1 %; every network's gradient points where the true one does, cosine above 0.9.
+def test_update_in_bf16(case: Case) -> None:
+    """Losses agree to 1 %, and every network's gradient has a cosine above 0.9 with the true one.
 
-    A sharper bound would bind the rounding: the actor's gradient is a small difference of large
+    A tighter bound would test the rounding: the actor's gradient is a small difference of large
     terms, and bf16 has eight binary digits.
     """
     case = replace(case, config=replace(case.config, precision="bf16"), batch=64)
@@ -261,7 +261,7 @@ def test_bf16(case: Case) -> None:
     found = gradients_of(agent)
     assert found.keys() == report.gradients.keys()
     for symbol in (*reference.CRITIC_LEARNS, *reference.ACTOR_LEARNS):
-        names = reference.of(found, [symbol])  # none for the identity's zeta
+        names = reference.of(found, [symbol])  # the identity has no zeta
         if names:
             g, truth = (
                 torch.cat([of[n].flatten() for n in names]) for of in (found, report.gradients)
@@ -270,11 +270,11 @@ def test_bf16(case: Case) -> None:
             assert 0.7 < g.norm() / truth.norm() < 1.4, symbol
 
 
-# -- the comparison would see a misreading -------------------------------------------------------
+# -- the comparison detects errors ---------------------------------------------------------------
 
 
-def apart_after(case: Case, spec: reference.Spec, updates: int = 1) -> float:
-    """The largest difference in a gradient or a weight when the reference follows `spec`."""
+def largest_error(case: Case, spec: reference.Spec, updates: int = 1) -> float:
+    """Return the largest error of a gradient or a weight if the reference follows `spec`."""
     agent = prepared(case, torch.float64)
     state = state_of(agent)
     for seed in range(updates):
@@ -286,23 +286,23 @@ def apart_after(case: Case, spec: reference.Spec, updates: int = 1) -> float:
     return max(found.values())
 
 
-def test_actions_lie_at_the_clamp_and_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_comparison_includes_actions_beyond_the_clamp(monkeypatch: pytest.MonkeyPatch) -> None:
     case, beyond_the_clamp = CASES[0], []
 
     def plain_clamp(a: Tensor) -> Tensor:
         beyond_the_clamp.append(float((a.abs() > 1).double().mean()))
         return a.clamp(-1, 1)
 
-    assert apart_after(case, case.spec) < 1e-8
+    assert largest_error(case, case.spec) < 1e-8
     monkeypatch.setattr(reference, "clamp_straight_through", plain_clamp)
-    assert apart_after(case, case.spec) > 1e-4
+    assert largest_error(case, case.spec) > 1e-4
     assert all(0.02 < share < 0.5 for share in beyond_the_clamp)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"averaged": ("phi_1", "phi_2")},  # of an agent that averages the fusion too
+        {"averaged": ("phi_1", "phi_2")},  # the agent averages the fusion too
         {"clip": 10.0},
         {"sigma": 0.19},
         {"tau": 0.0101},
@@ -311,16 +311,16 @@ def test_actions_lie_at_the_clamp_and_beyond(monkeypatch: pytest.MonkeyPatch) ->
     ],
     ids=lambda change: next(iter(change)),
 )
-def test_another_number_is_seen(change: dict[str, object]) -> None:
+def test_comparison_detects_another_value(change: dict[str, object]) -> None:
     case = next(case for case in CASES if case.name == "averaged-fusion")
-    assert apart_after(case, case.spec) < 1e-8
-    assert apart_after(case, replace(case.spec, **change)) > 1e-8
+    assert largest_error(case, case.spec) < 1e-8
+    assert largest_error(case, replace(case.spec, **change)) > 1e-8
 
 
-# -- chance --------------------------------------------------------------------------------------
+# -- random numbers ------------------------------------------------------------------------------
 
 
-def test_update_is_learn_with_its_own_draws() -> None:
+def test_update_is_draw_followed_by_learn() -> None:
     case, agent, twin = CASES[0], CASES[0].agent(), CASES[0].agent()
     for seed in range(2):
         batch = case.batch_of(seed)
@@ -330,8 +330,8 @@ def test_update_is_learn_with_its_own_draws() -> None:
     assert all(map(torch.equal, weights_of(agent).values(), weights_of(twin).values()))
 
 
-def test_draws_are_clipped_noise_and_whole_shifts() -> None:
-    """A clipped normal: 13.4 % of it lies on the bounds, 1.5 sigma out; inside, sigma is 0.2."""
+def test_draw_returns_clipped_noise_and_independent_shifts() -> None:
+    """Of a normal with sigma 0.2, clipped at 1.5 sigma, 13.4 % are on the bounds."""
     case = replace(CASES[5], batch=4000)
     batch = replace(CASES[5], batch=1).batch_of(0)
     batch = replace(batch, action=torch.zeros(case.batch, 6))
@@ -352,7 +352,7 @@ def test_draws_are_clipped_noise_and_whole_shifts() -> None:
             assert torch.corrcoef(columns)[0, 1].abs() < 0.08
 
 
-def test_no_shift_is_drawn_where_there_is_none() -> None:
+def test_no_shift_is_drawn_if_shift_pad_is_0() -> None:
     case = replace(CASES[0], config=replace(SMALL, shift_pad=0))
     assert case.agent().draw(case.batch).shifts == {}
     agent = double(case.agent())

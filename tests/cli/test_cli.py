@@ -40,7 +40,7 @@ SMALL_VIDEO = ["--render-size", "64"]
 def small_videos() -> Iterator[None]:
     """Allow rendering below the minimum size of a video; the video enlarges the frames."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("merl.training.setup", "merl.cli.evaluate"):
+        for module in ("merl.training.setup", "merl.evaluation.evaluation"):
             patch.setattr(f"{module}.MIN_SIDE", 16)
         yield
 
@@ -372,12 +372,12 @@ BAD = {
     "train reach_duplo --replay.batch-size 1000000 --steps 1000000": "1000000 would take",
     "train reach_duplo --agent.hidden-dim 60000": "networks of agent.* would take",
     "train reach_duplo --agent.hidden-dim 100000000": "hidden-dim must be at least 1 and at most",
-    "train reach_duplo --agent.shift-pad 32": "out of sight: give at most 31",
+    "train reach_duplo --agent.shift-pad 32": "pixels: use at most 31",
     "train reach_duplo --threads 1000000": "but this machine has",
     "train reach_duplo --render-size 100000": "render_size is 100000: ",
     f"train reach_duplo --run-dir {'a' * 300}": "cannot be used: File name too long",
-    "train reach_duplo --agent ddpg --agent.fusion shared": "agent.latent-dim 0 there is none",
-    "train reach_duplo --agent.latent-dim 0 --agent.no-fusion-norm": "fusion-norm False is of a",
+    "train reach_duplo --agent ddpg --agent.fusion shared": "which agent.latent-dim 0 disables",
+    "train reach_duplo --agent.latent-dim 0 --agent.no-fusion-norm": "norm False is an option of",
     "train reach_duplo --agent.tau 0": "(0, 1], not 0.0",
     "train reach_duplo --agent.tau 1.01": "(0, 1], not 1.01",
     "train reach_duplo --agent.tau nan": "(0, 1], not nan",
@@ -480,7 +480,7 @@ def test_device_cuda_without_cuda_is_refused(
     monkeypatch.chdir(tmp_path)
     assert main(["train", "reach_duplo", "--preset", "smoke", "--device", "cuda"]) == 2
     error = capsys.readouterr().err
-    assert "no CUDA device is found" in error
+    assert "no CUDA device was found" in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 

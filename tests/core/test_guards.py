@@ -89,7 +89,7 @@ def test_a_non_finite_reward_or_observation_stops_the_run(
     assert "Traceback" not in err
     start = Checkpoint.find(Run.open(run).checkpoints)
     assert start.step == BAD_STEP - 1
-    assert f"the run is saved at step {BAD_STEP - 1}: mend it" in err
+    assert f"the run is saved at step {BAD_STEP - 1}: fix the cause" in err
     for name in ("reward", "observation.state"):
         assert np.isfinite(np.fromfile(run / "replay" / f"{name}.bin", "<f4")).all()
 

@@ -80,7 +80,7 @@ def test_other_keys_than_images_and_vectors_are_left_out_with_a_reason() -> None
     space = spaces.Dict({"arm": vector(2), "gear": spaces.Discrete(3), "map": vector(4)})
     env = adapt(SpaceEnv(space))
     assert env.get_wrapper_attr("left_out") == {
-        "gear": "Discrete(3): give it as one-hot, a float32 box of 3 numbers"
+        "gear": "Discrete(3): encode it as one-hot, a float32 box of 3 numbers"
     }
     assert set(env.observation_space) == {"arm", "map"}  # type: ignore[call-overload]
     assert set(env.reset()[0]) == {"arm", "map"}

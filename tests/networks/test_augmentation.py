@@ -1,4 +1,4 @@
-"""Random shift against its definition and against DrQ-v2's way to write it; the network's input."""
+"""Random shift against its definition and DrQ-v2's implementation; conversion to network input."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ SHAPES = [(1, 3, 84, 84, 3), (5, 2, 9, 12, 1), (3, 1, 4, 3, 3)]  # (B, K, H, W, 
 both_paths = pytest.mark.parametrize("path", [_shift_by_index, shift])
 
 
-def pictures(shape: tuple[int, ...], seed: int = 0) -> Tensor:
+def random_images(shape: tuple[int, ...], seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
 
 
 def padded_crop(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
-    """MERL 4.1, pixel by pixel: what lies outside the image is its nearest edge."""
+    """MERL 4.1, pixel by pixel: a position outside the image takes the nearest edge pixel."""
     height, width = images.shape[2:4]
     shifted = torch.empty_like(images)
     for b, (top, left) in enumerate(shifts.tolist()):
@@ -55,8 +55,8 @@ def grid_sampled(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
 @both_paths
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("pad", [1, 4])
-def test_the_padded_crop(path, shape: tuple[int, ...], pad: int) -> None:
-    images = pictures(shape)
+def test_shift_equals_padded_crop(path, shape: tuple[int, ...], pad: int) -> None:
+    images = random_images(shape)
     shifts = draw_shifts(shape[0], pad, torch.Generator().manual_seed(1))
     shifted = path(images, shifts, pad)
     assert shifted.dtype == torch.uint8
@@ -64,15 +64,15 @@ def test_the_padded_crop(path, shape: tuple[int, ...], pad: int) -> None:
 
 
 @both_paths
-def test_drqv2s_grid_sample(path) -> None:
-    images = pictures((81, 3, 84, 84, 1))
-    shifts = torch.cartesian_prod(torch.arange(9), torch.arange(9))  # every one there is
-    apart = (path(images, shifts, 4).float() - grid_sampled(images, shifts, 4)).abs()
-    assert apart.max() < 0.01  # of 255: float32's rounding of the grid
+def test_shift_equals_grid_sample_of_drqv2(path) -> None:
+    images = random_images((81, 3, 84, 84, 1))
+    shifts = torch.cartesian_prod(torch.arange(9), torch.arange(9))  # all shifts
+    difference = (path(images, shifts, 4).float() - grid_sampled(images, shifts, 4)).abs()
+    assert difference.max() < 0.01  # of 255; rounding of the grid in float32
 
 
 @both_paths
-def test_the_extremes(path) -> None:
+def test_largest_and_zero_shifts(path) -> None:
     image = torch.arange(30, dtype=torch.uint8).reshape(1, 1, 5, 6, 1)
     far = path(image, torch.tensor([[0, 0]]), 4)[0, 0, ..., 0]
     assert torch.equal(far[:4, :4], torch.zeros(4, 4, dtype=torch.uint8))
@@ -86,8 +86,8 @@ def test_the_extremes(path) -> None:
 
 
 @both_paths
-def test_a_stack_moves_as_one_and_samples_on_their_own(path) -> None:
-    images = pictures((2, 1, 12, 12, 3)).expand(2, 3, 12, 12, 3)
+def test_frames_of_a_stack_shift_together_and_samples_independently(path) -> None:
+    images = random_images((2, 1, 12, 12, 3)).expand(2, 3, 12, 12, 3)
     shifted = path(images, torch.tensor([[1, 7], [6, 2]]), 4)
     assert torch.equal(shifted[:, 0], shifted[:, 1])
     assert torch.equal(shifted[:, 0], shifted[:, 2])
@@ -95,8 +95,8 @@ def test_a_stack_moves_as_one_and_samples_on_their_own(path) -> None:
     assert torch.equal(shifted[1, 0, 0:-2, 2:], images[1, 0, 2:, 0:-2])
 
 
-def test_the_original_is_left_alone() -> None:
-    images = pictures((2, 3, 8, 8, 3))
+def test_shift_does_not_change_its_input() -> None:
+    images = random_images((2, 3, 8, 8, 3))
     before = images.clone()
     shift(images, torch.tensor([[0, 0], [4, 4]]), 4).fill_(7)
     assert torch.equal(images, before)
@@ -104,19 +104,19 @@ def test_the_original_is_left_alone() -> None:
 
 @pytest.mark.parametrize("pad", [1, 4])
 def test_shifts_are_uniform(pad: int) -> None:
-    size, ring_index = 90_000, 2 * pad + 1
+    size, offsets = 90_000, 2 * pad + 1
     shifts = draw_shifts(size, pad, torch.Generator().manual_seed(0))
     assert shifts.dtype == torch.int64
     assert shifts.shape == (size, 2)
-    cells = torch.bincount(shifts[:, 0] * ring_index + shifts[:, 1], minlength=ring_index**2)
-    assert len(cells) == ring_index**2
-    expected = size / ring_index**2
+    cells = torch.bincount(shifts[:, 0] * offsets + shifts[:, 1], minlength=offsets**2)
+    assert len(cells) == offsets**2
+    expected = size / offsets**2
     chi_squared = float(((cells - expected) ** 2 / expected).sum())
-    freedom = ring_index**2 - 1
+    freedom = offsets**2 - 1
     assert chi_squared < freedom + 5 * np.sqrt(2 * freedom)
 
 
-def test_shifts_follow_the_generator() -> None:
+def test_generator_determines_shifts() -> None:
     first, again, other = (
         draw_shifts(50, 4, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1)
     )
@@ -126,8 +126,10 @@ def test_shifts_follow_the_generator() -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
-def test_the_input(shape: tuple[int, ...], dtype: torch.dtype) -> None:
-    images = pictures(shape)
+def test_input_has_centred_pixels_in_channel_order(
+    shape: tuple[int, ...], dtype: torch.dtype
+) -> None:
+    images = random_images(shape)
     batch, stack, height, width, channels = shape
     x = to_input(images, dtype)
     assert x.dtype == dtype
@@ -138,13 +140,13 @@ def test_the_input(shape: tuple[int, ...], dtype: torch.dtype) -> None:
             assert torch.equal(x[:, frame * channels + channel].to(torch.float64), expected)
 
 
-def test_the_input_is_exact_for_every_byte() -> None:
+def test_input_is_exact_for_every_byte() -> None:
     images = torch.arange(256, dtype=torch.uint8).reshape(256, 1, 1, 1, 1)
     x = to_input(images, torch.bfloat16)
     assert torch.equal(x.flatten().long(), torch.arange(256) - 128)
-    assert torch.equal(images.flatten().long(), torch.arange(256))  # which stay as they are
+    assert torch.equal(images.flatten().long(), torch.arange(256))  # unchanged
 
 
-def test_the_input_lies_channels_last() -> None:
-    x = to_input(pictures((2, 3, 8, 9, 3)), torch.float32)
+def test_input_is_channels_last() -> None:
+    x = to_input(random_images((2, 3, 8, 9, 3)), torch.float32)
     assert x.is_contiguous(memory_format=torch.channels_last)

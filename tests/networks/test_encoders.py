@@ -1,4 +1,4 @@
-"""Encoders: their lengths, the order of the flat features, what they refuse."""
+"""Encoders: number and order of the features, scaling of inputs, and rejected configs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_pixels_are_scaled_to_half_a_unit_on_each_side(shade: int) -> None:
 @pytest.mark.parametrize(
     ("low", "high"), [(0, 1), (0, 2), (0, 254), (0, 255), (1, 255), (200, 231)]
 )
-def test_pixels_are_scaled_by_their_own_bounds(low: int, high: int) -> None:
+def test_pixels_are_scaled_by_the_given_bounds(low: int, high: int) -> None:
     torch.manual_seed(0)
     encoder = ConvEncoder(2, (5, 5), channels=4, strides=(2,), pixels=(low, high)).double()
     stacks = torch.randint(low, high + 1, (3, 2, 5, 5, 1), dtype=torch.uint8)
@@ -38,7 +38,7 @@ def test_pixels_are_scaled_by_their_own_bounds(low: int, high: int) -> None:
     torch.testing.assert_close(encoder(stacks), expected, rtol=0, atol=1e-12)
 
 
-def test_in_bf16_a_mask_of_0_and_1_is_seen_as_exactly_as_a_picture() -> None:
+def test_bf16_encodes_a_binary_mask_accurately() -> None:
     torch.manual_seed(0)
     encoder = ConvEncoder(9, (84, 84), pixels=(0, 1))
     orthogonal(encoder)
@@ -48,8 +48,8 @@ def test_in_bf16_a_mask_of_0_and_1_is_seen_as_exactly_as_a_picture() -> None:
         assert (encoder(mask) - exact).norm() < 0.01 * exact.norm()
 
 
-def test_in_bf16_a_dark_picture_and_a_bright_one_are_as_near_as_in_single_precision() -> None:
-    """A bias that took in half of all weights would be rounded coarsely, the same for all."""
+def test_bf16_encodes_dark_and_bright_images_accurately() -> None:
+    """A bias that absorbed half of all weights would be rounded coarsely, for all images alike."""
     torch.manual_seed(0)
     encoder = ConvEncoder(9, (84, 84))
     orthogonal(encoder)
@@ -61,7 +61,7 @@ def test_in_bf16_a_dark_picture_and_a_bright_one_are_as_near_as_in_single_precis
         assert (rounded - exact).norm() < 0.01 * exact.norm()
 
 
-def test_the_papers_encoder() -> None:
+def test_default_is_the_papers_encoder() -> None:
     encoder = ConvEncoder(9, (84, 84))
     convolutions = [m for m in encoder.modules() if isinstance(m, torch.nn.Conv2d)]
     assert [c.stride[0] for c in convolutions] == [2, 1, 1, 1]
@@ -71,12 +71,14 @@ def test_the_papers_encoder() -> None:
 
 @pytest.mark.parametrize("size", [(24, 28), (48, 48), (17, 31)])
 @pytest.mark.parametrize("strides", [(2, 1, 1, 1), (2, 2, 1), (1,), (3, 2)])
-def test_features_are_as_many_as_said(size: tuple[int, int], strides: tuple[int, ...]) -> None:
+def test_attribute_features_is_the_output_length(
+    size: tuple[int, int], strides: tuple[int, ...]
+) -> None:
     encoder = ConvEncoder(6, size, channels=4, strides=strides)
     assert encoder(noise(2, 3, *size, 2)).shape == (2, encoder.features)
 
 
-def test_features_go_by_rows_columns_channels() -> None:
+def test_features_are_ordered_by_row_column_channel() -> None:
     encoder = ConvEncoder(3, (9, 11), channels=4, strides=(2,))
     stacks = noise(2, 3, 9, 11, 1)
     maps = encoder.convolutions(stacks[..., 0] / 255 - 0.5)  # (2, 4, 4, 5)
@@ -84,7 +86,7 @@ def test_features_go_by_rows_columns_channels() -> None:
     for row, column, channel in [(0, 0, 0), (1, 3, 2), (3, 4, 3)]:
         flat = (row * 5 + column) * 4 + channel
         torch.testing.assert_close(features[:, flat], maps[:, channel, row, column])
-    assert features.min() >= 0  # a ReLU is the last thing
+    assert features.min() >= 0  # the last layer is a ReLU
 
 
 @pytest.mark.parametrize(
@@ -98,7 +100,7 @@ def test_features_go_by_rows_columns_channels() -> None:
         ((1, 1), (4, 4), False),
     ],
 )
-def test_an_image_too_small_is_refused(
+def test_too_small_image_is_rejected(
     size: tuple[int, int], strides: tuple[int, ...], fits: bool
 ) -> None:
     if fits:
@@ -108,7 +110,7 @@ def test_an_image_too_small_is_refused(
             ConvEncoder(3, size, strides=strides)
 
 
-def test_the_identity() -> None:
+def test_vector_encoder_of_width_0_is_the_identity() -> None:
     encoder = VectorEncoder(7)
     vector = torch.randn(3, 7)
     assert encoder(vector) is vector
@@ -116,7 +118,7 @@ def test_the_identity() -> None:
     assert not list(encoder.parameters())
 
 
-def test_vectors_are_brought_to_one_scale() -> None:
+def test_vectors_are_standardised() -> None:
     draw = torch.Generator().manual_seed(0)
     scale = torch.tensor([5.0, 0.05, 0.0, 1e-4])
     center = torch.tensor([1.0, -0.2, 0.18, 0.0])
@@ -135,12 +137,12 @@ def test_vectors_are_brought_to_one_scale() -> None:
     encoded = encoder(vectors(10_000))
     assert encoded.std(0)[:2] == pytest.approx(torch.ones(2), rel=0.1)
     assert encoded.mean(0) == pytest.approx(torch.zeros(4), abs=0.15)
-    assert encoded.std(0)[2] < 1e-3  # what never varied is not blown up
+    assert encoded.std(0)[2] < 1e-3  # a constant entry is not amplified
     assert encoded.std(0)[3] == pytest.approx(0.01, rel=0.1)
     assert not list(encoder.parameters())
 
 
-def test_the_scale_stays_once_it_has_seen_enough() -> None:
+def test_standardisation_is_fixed_after_enough_samples() -> None:
     scale = Standardize(1)
     for _ in range(Standardize.STEADY // 1000):
         scale.observe(torch.randn(1000, 1))
@@ -150,7 +152,7 @@ def test_the_scale_stays_once_it_has_seen_enough() -> None:
         assert torch.equal(value, before[name])
 
 
-def test_the_scale_is_right_far_from_zero() -> None:
+def test_standardisation_is_accurate_far_from_zero() -> None:
     scale = Standardize(1)
     vectors = 1e4 + torch.randn(10, 500, 1, generator=torch.Generator().manual_seed(0))
     for batch in vectors:
@@ -158,13 +160,13 @@ def test_the_scale_is_right_far_from_zero() -> None:
     assert scale(vectors.flatten(0, 1)).std() == pytest.approx(1, rel=0.01)
 
 
-def test_what_lies_far_off_is_brought_near() -> None:
+def test_outliers_are_clipped() -> None:
     scale = Standardize(2)
     scale.observe(torch.zeros(100, 2))
     assert scale(torch.tensor([[0.02, 3.0], [-1.0, 0.0]])).tolist() == [[2, 5], [-5, 0]]
 
 
-def test_the_mlp_has_two_layers_and_ends_in_a_relu() -> None:
+def test_mlp_has_two_layers_and_ends_in_a_relu() -> None:
     encoder = VectorEncoder(7, 16)
     assert encoder.features == 16
     assert sum(isinstance(m, torch.nn.Linear) for m in encoder.modules()) == 2

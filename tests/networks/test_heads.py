@@ -1,4 +1,4 @@
-"""Heads: the layers that C.1 counts, their norms, and two Qs that share nothing but the input."""
+"""Heads: number of layers as in C.1, their norms, and two Qs that share only the input."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from merl.networks.heads import MLP, Actor, HeadSize, Norm
 
 @pytest.mark.parametrize("layers", [1, 3, 6])
 @pytest.mark.parametrize("norm", ["layer", "none"])
-def test_the_output_layer_is_counted(layers: int, norm: Norm) -> None:
+def test_layers_include_the_output_layer(layers: int, norm: Norm) -> None:
     head = MLP(10, 4, HeadSize(layers, 16, norm))
     kinds = [type(m) for m in head.modules()]
     linear = sum(isinstance(m, nn.Linear) for m in head.modules())
@@ -21,7 +21,7 @@ def test_the_output_layer_is_counted(layers: int, norm: Norm) -> None:
     assert head(torch.randn(5, 10)).shape == (5, 4)
 
 
-def test_the_actor_ranges_over_plus_and_minus_one() -> None:
+def test_actions_are_in_minus_one_to_one() -> None:
     actions = Actor(10, 4, HeadSize(3, 32))(100 * torch.randn(500, 10))
     assert actions.abs().max() <= 1
     with torch.no_grad():
@@ -29,7 +29,7 @@ def test_the_actor_ranges_over_plus_and_minus_one() -> None:
     assert (actor(torch.randn(500, 10)) > 0.9).all()
 
 
-def test_the_twins_are_apart() -> None:
+def test_twin_heads_share_no_weights() -> None:
     critic = TwinCritic(10, 4, HeadSize(3, 32))
     latent, action = torch.randn(50, 10), torch.rand(50, 4)
     q1, q2 = critic(latent, action)
@@ -44,8 +44,8 @@ def test_the_twins_are_apart() -> None:
 
 @pytest.mark.parametrize("layers", [1, 4])
 @pytest.mark.parametrize("norm", ["layer", "none"])
-def test_the_twins_at_once_are_the_twins_one_by_one(layers: int, norm: Norm) -> None:
-    """Values, and gradients of the action and of every weight; in bf16, too."""
+def test_twins_at_once_equal_twins_one_by_one(layers: int, norm: Norm) -> None:
+    """Compare values, and gradients of the action and of every weight, also in bf16."""
     critic = TwinCritic(10, 4, HeadSize(layers, 32, norm)).double()
     for parameter in critic.parameters():
         nn.init.normal_(parameter, 0.0, 0.3)
@@ -54,11 +54,11 @@ def test_the_twins_at_once_are_the_twins_one_by_one(layers: int, norm: Norm) -> 
     def values_and_gradients(dtype: torch.dtype, at_once: bool) -> list[torch.Tensor]:
         critic.at_once = at_once
         critic.to(torch.float64 if dtype == torch.float64 else torch.float32)
-        sight = latent.to(next(critic.parameters()).dtype)
+        state = latent.to(next(critic.parameters()).dtype)
         with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-            q1, q2 = critic(sight, action.to(sight.dtype))
-        learns = [action, *critic.parameters()]
-        return [q1, q2, *torch.autograd.grad((q1 * q2).sum(), learns)]
+            q1, q2 = critic(state, action.to(state.dtype))
+        inputs = [action, *critic.parameters()]
+        return [q1, q2, *torch.autograd.grad((q1 * q2).sum(), inputs)]
 
     for dtype, bound in ((torch.float64, 1e-12), (torch.float32, 1e-5), (torch.bfloat16, 1e-5)):
         one_by_one, at_once = (values_and_gradients(dtype, way) for way in (False, True))

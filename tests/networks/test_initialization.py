@@ -1,4 +1,4 @@
-"""Orthogonal weights, biases at zero (C.1), as MERL's networks come out of `make_agent`."""
+"""Orthogonal weights and zero biases (C.1) in MERL's networks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from merl.networks.initialization import orthogonal
 
 
 def is_orthogonal(weight: Tensor, gain: float) -> bool:
-    """W W^T = gain^2 I, or W^T W where there are more rows than columns."""
+    """Return whether W W^T = gain^2 I, or W^T W if there are more rows than columns."""
     matrix = weight.detach().double().flatten(1)
     rows, columns = matrix.shape
     gram = matrix @ matrix.T if rows <= columns else matrix.T @ matrix
@@ -36,7 +36,7 @@ def networks() -> nn.Module:
     return make_networks(config, space, 6, 3)
 
 
-def test_every_layer_of_merl(networks: nn.Module) -> None:
+def test_every_layer_of_merl_is_initialised(networks: nn.Module) -> None:
     kinds = {nn.Linear: 0, nn.Conv2d: 0, nn.LayerNorm: 0}
     for layer in networks.modules():
         kind = next((kind for kind in kinds if isinstance(layer, kind)), None)
@@ -48,11 +48,11 @@ def test_every_layer_of_merl(networks: nn.Module) -> None:
         else:
             assert is_orthogonal(layer.weight, math.sqrt(2) if isinstance(layer, nn.Conv2d) else 1)
         assert not layer.bias.any()
-    # Two of the MLP encoder, two fusions of two senses, three heads of four layers.
+    # Two of the MLP encoder, two fusions of two modalities, three heads of four layers.
     assert kinds == {nn.Linear: 2 + 4 + 12, nn.Conv2d: 4, nn.LayerNorm: 4 + 9}
 
 
-def test_no_two_layers_are_alike(networks: nn.Module) -> None:
+def test_no_two_layers_are_equal(networks: nn.Module) -> None:
     weights = [p for p in networks.parameters() if p.ndim > 1]
     for i, a in enumerate(weights):
         assert not any(torch.equal(a, b) for b in weights[:i] if a.shape == b.shape)
@@ -65,7 +65,7 @@ def test_convolutions_stay_channels_last() -> None:
     assert is_orthogonal(convolution.weight, math.sqrt(2))
 
 
-def test_the_memory_order_does_not_change_the_numbers() -> None:
+def test_memory_order_does_not_change_the_weights() -> None:
     weights = []
     for order in (torch.contiguous_format, torch.channels_last):
         convolution = nn.Conv2d(6, 8, 3).to(memory_format=order)

@@ -1,4 +1,4 @@
-"""The histogram of a target, against SciPy in float64; how values and losses follow from it."""
+"""Histogram of a target against SciPy in float64; values and losses of histograms."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from merl.training.setup import bounded
 TARGETS = [-1e6, -5.0, -2.0, -1.999, 0.0, 0.01, 3.3, 7.0, 7.999, 8.0, 8.001, 50.0, 1e6]
 
 
-def shares(y: float, low: float, high: float, bins: int) -> list[float]:
-    """Of a Gaussian about y in each bin, one bin after the other."""
+def probabilities(y: float, low: float, high: float, bins: int) -> list[float]:
+    """Compute each bin's probability of a Gaussian with mean y, one bin after the other."""
     width = (high - low) / (bins - 6)
     y = min(max(y, low), high)
     gaussian = scipy.stats.norm(y, 0.75 * width)
@@ -25,88 +25,88 @@ def shares(y: float, low: float, high: float, bins: int) -> list[float]:
     mass = [
         gaussian.cdf(first + (i + 1) * width) - gaussian.cdf(first + i * width) for i in range(bins)
     ]
-    return [share / sum(mass) for share in mass]
+    return [part / sum(mass) for part in mass]
 
 
 @pytest.mark.parametrize("bins", [7, 20, 101])
-def test_targets_become_gaussians_also_at_the_bounds_and_beyond(bins: int) -> None:
-    form = HLGauss(-2.0, 8.0, bins)
-    expected = np.array([shares(y, -2.0, 8.0, bins) for y in TARGETS])
-    found = form.double().histogram(torch.tensor(TARGETS, dtype=torch.float64))
+def test_targets_become_gaussians_inside_at_and_beyond_the_bounds(bins: int) -> None:
+    returns = HLGauss(-2.0, 8.0, bins)
+    expected = np.array([probabilities(y, -2.0, 8.0, bins) for y in TARGETS])
+    found = returns.double().histogram(torch.tensor(TARGETS, dtype=torch.float64))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-    found = form.float().histogram(torch.tensor(TARGETS))
+    found = returns.float().histogram(torch.tensor(TARGETS))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
     np.testing.assert_allclose(found.sum(-1), 1.0, rtol=1e-5)
 
 
-def test_the_mean_of_a_histogram_is_its_target() -> None:
-    form = HLGauss(0.0, 100.0, 101)
+def test_mean_of_a_histogram_is_its_target() -> None:
+    returns = HLGauss(0.0, 100.0, 101)
     y = torch.tensor([0.0, 1e-3, 0.4, 12.3, 99.9, 100.0])
-    logits = form.histogram(y).clamp(min=1e-30).log()
-    torch.testing.assert_close(form.value(logits), y, rtol=1e-4, atol=2e-3)
-    beyond = form.histogram(torch.tensor([-7.0, 130.0])).clamp(min=1e-30).log()
-    torch.testing.assert_close(form.value(beyond), torch.tensor([0.0, 100.0]), rtol=0, atol=2e-3)
+    logits = returns.histogram(y).clamp(min=1e-30).log()
+    torch.testing.assert_close(returns.value(logits), y, rtol=1e-4, atol=2e-3)
+    beyond = returns.histogram(torch.tensor([-7.0, 130.0])).clamp(min=1e-30).log()
+    torch.testing.assert_close(returns.value(beyond), torch.tensor([0.0, 100.0]), rtol=0, atol=2e-3)
 
 
-def test_the_loss_is_least_at_the_histogram_and_pulls_the_value_to_the_target() -> None:
-    form = HLGauss(0.0, 10.0, 31)
+def test_minimising_the_loss_moves_the_value_to_the_target() -> None:
+    returns = HLGauss(0.0, 10.0, 31)
     y = torch.tensor([2.0, 9.0])
     logits = torch.zeros(2, 31, requires_grad=True)
     optimizer = torch.optim.Adam([logits], lr=0.1)
-    first = form.loss(logits, logits, y).item()
+    first = returns.loss(logits, logits, y).item()
     for _ in range(300):
         optimizer.zero_grad()
-        loss = form.loss(logits, logits, y)
+        loss = returns.loss(logits, logits, y)
         loss.backward()
         optimizer.step()
-    histogram = form.histogram(y)
+    histogram = returns.histogram(y)
     entropy = 2 * -(histogram * histogram.clamp(min=1e-30).log()).sum(-1).mean()
     assert entropy - 1e-5 < loss.item() < entropy + 0.05 < first
-    torch.testing.assert_close(form.value(logits).detach(), y, rtol=0, atol=0.05)
+    torch.testing.assert_close(returns.value(logits).detach(), y, rtol=0, atol=0.05)
 
 
 def test_autocast_does_not_round_values() -> None:
-    form = HLGauss(0.0, 100.0, 101)
+    returns = HLGauss(0.0, 100.0, 101)
     logits = torch.randn(8, 101)
     with torch.autocast("cpu", torch.bfloat16):
-        value = form.value(logits)
-    assert torch.equal(value, form.value(logits))
+        value = returns.value(logits)
+    assert torch.equal(value, returns.value(logits))
 
 
 @pytest.mark.parametrize("low", [-50.0, 0.0, 20.0])
-def test_the_first_values_are_near_zero_or_the_nearer_bound(low: float) -> None:
-    form = HLGauss(low, 100.0, 101)
+def test_initial_values_are_near_zero_or_the_nearer_bound(low: float) -> None:
+    returns = HLGauss(low, 100.0, 101)
     bias = torch.zeros(101)
-    form.start_at_zero(bias)
-    assert form.value(bias).item() == pytest.approx(max(low, 0.0), abs=0.1)
+    returns.start_at_zero(bias)
+    assert returns.value(bias).item() == pytest.approx(max(low, 0.0), abs=0.1)
 
 
-def test_the_highest_return_follows_from_the_discount() -> None:
+def test_discount_sets_the_highest_return() -> None:
     config = AgentConfig(critic_loss="hl_gauss")
     assert bounded(config, 0.95).critic_high == 20.0
     assert bounded(AgentConfig(), 0.95).critic_high is None
     chosen = AgentConfig(critic_loss="hl_gauss", critic_high=7.0)
     assert bounded(chosen, 1.0).critic_high == 7.0
-    with pytest.raises(MerlError, match=r"discount 1 leaves .* give --agent.critic-high"):
+    with pytest.raises(MerlError, match=r"discount 1 returns have .* set --agent.critic-high"):
         bounded(config, 1.0)
 
 
 @pytest.mark.parametrize(
-    ("values", "says"),
+    ("values", "message"),
     [
         ({"critic_loss": "huber"}, "agent.critic-loss .*huber"),
         ({"critic_bins": 6}, "agent.critic-bins must be at least 7"),
         ({"critic_low": float("nan")}, "agent.critic-low must be finite, not nan"),
         ({"critic_high": float("inf")}, "agent.critic-high must be finite, not inf"),
         ({"critic_low": 3.0, "critic_high": 3.0}, "critic-high must be above .* 3.0, not 3.0"),
-        ({"critic_loss": "mse", "critic_bins": 51}, "critic-bins 51 is of a histogram"),
+        ({"critic_loss": "mse", "critic_bins": 51}, "critic-bins 51 is an option of the hist"),
     ],
 )
-def test_a_bad_value_is_named(values: dict[str, object], says: str) -> None:
-    with pytest.raises(MerlError, match=says):
+def test_error_names_the_invalid_value(values: dict[str, object], message: str) -> None:
+    with pytest.raises(MerlError, match=message):
         AgentConfig(**{"critic_loss": "hl_gauss", **values})  # type: ignore[arg-type]
 
 
-def test_sac_refuses_a_histogram() -> None:
-    with pytest.raises(MerlError, match="critic-loss hl_gauss needs returns within bounds"):
+def test_sac_rejects_a_histogram() -> None:
+    with pytest.raises(MerlError, match="critic-loss hl_gauss needs bounded returns"):
         SACConfig(critic_loss="hl_gauss")

@@ -1,4 +1,4 @@
-"""The program around merl may set torch as it likes: agents are built, act and learn the same."""
+"""Agents are built, act and learn the same, whatever settings of torch the program has changed."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ SETTERS = [set_double, set_meta, set_no_gradients, set_threads, set_deterministi
 
 @contextmanager
 def disturbed(by: str) -> Iterator[None]:
-    """The settings of a program that has set torch in its own way."""
+    """Run with torch settings changed by `by`: the name of a setter, all or inference."""
     if by == "inference":
         with torch.inference_mode():
             yield
@@ -102,7 +102,7 @@ def disturbed(by: str) -> Iterator[None]:
 
 
 def results(config: AgentConfig, folder: Path) -> list[Any]:
-    """Build, act, learn from a replay, save and load: everything that comes out."""
+    """Build an agent, act, learn from a replay, save and load; return all results."""
     agent = make_agent(config, SPACE, ACTIONS, frame_stack=3, seed=0, device=CPU, threads=1)
     with torch_settings(CPU):
         replay = ReplayBuffer(CONFIG.replay, SPACE, ACTIONS, count=1, directory=None, capacity=20)
@@ -141,20 +141,20 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
 
 
 @pytest.mark.parametrize("by", [*(setter.__name__ for setter in SETTERS), "all", "inference"])
-def test_agent_does_not_depend_on_the_programs_settings(
+def test_agent_does_not_depend_on_torch_settings(
     by: str, undisturbed: list[Any], tmp_path: Path
 ) -> None:
     with disturbed(by):
         before = all_settings()
         found = results(CONFIG.agent, tmp_path)
-        assert all_settings() == before  # nothing is changed for the program
+        assert all_settings() == before  # the program's settings are unchanged
     for one, other in zip(found, undisturbed, strict=True):
         np.testing.assert_array_equal(one, other)
         assert one.dtype == np.float32
 
 
 @pytest.mark.parametrize("by", ["all", "inference"])
-def test_sac_does_not_depend_on_the_programs_settings(by: str) -> None:
+def test_sac_does_not_depend_on_torch_settings(by: str) -> None:
     def weights() -> list[Any]:
         config = AGENTS["sac"]
         space = gymnasium.spaces.Dict({"state": SPACE["joint"]})
@@ -171,7 +171,7 @@ def test_sac_does_not_depend_on_the_programs_settings(by: str) -> None:
         np.testing.assert_array_equal(one, other)
 
 
-def test_threads_are_set_for_the_call_alone() -> None:
+def test_threads_are_set_only_during_the_call() -> None:
     torch.set_num_threads(2)
     with torch_settings(CPU, threads=1):
         assert torch.get_num_threads() == 1
@@ -191,7 +191,7 @@ def test_settings_are_restored_after_an_error() -> None:
 
 
 class Disturbing(DotEnv):
-    """An environment that leaves torch in another state whenever it is called."""
+    """An environment that changes torch's settings in every call."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -210,7 +210,7 @@ class Disturbing(DotEnv):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A run beside an environment that sets torch, and one beside the same that does not."""
+    """Two runs: with an environment that changes torch's settings, and with one that does not."""
     flags = ["--preset", "smoke", "--threads", "1", "--agent.precision", "fp32"]
     flags += ["--steps", "40", "--random-steps", "20", "--seed-steps", "20"]
     flags += ["--replay.batch-size", "8", "--eval.every", "30", "--eval.episodes", "1"]
@@ -222,7 +222,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         patch.syspath_prepend(str(Path(__file__).parent))
         for name in ("Disturbing", "DotEnv"):
             run = tmp_path_factory.mktemp("runs") / name
-            with disturbed("none"):  # restores what the environment leaves behind
+            with disturbed("none"):  # restore what the environment has changed
                 assert main(["train", f"test_settings:{name}", *flags, "--run-dir", str(run)]) == 0
                 assert main(["resume", str(run), "--steps", "50"]) == 0
                 assert main(["evaluate", str(run), "--episodes", "1"]) == 0
@@ -230,7 +230,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return folders
 
 
-def test_run_learns_the_same_beside_an_environment_that_sets_torch(runs: list[Path]) -> None:
+def test_environment_that_changes_torch_settings_does_not_change_weights(runs: list[Path]) -> None:
     weights = [(run / "checkpoints/00000050/weights.safetensors").read_bytes() for run in runs]
     assert weights[0] == weights[1]
 

@@ -1,4 +1,4 @@
-"""The compressed replay gives what the raw one gives, byte for byte, in a quarter of the space."""
+"""The compressed replay equals the raw one byte for byte, in a quarter of the space."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def config(**values: object) -> ReplayConfig:
 
 
 def noise(number: int) -> dict[str, np.ndarray]:
-    """What no compression makes smaller."""
+    """Return an incompressible image."""
     rng = np.random.default_rng(number)
     return {"image": rng.integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)}
 
@@ -38,7 +38,7 @@ Observe = Callable[[int], dict[str, np.ndarray]]
 def play(
     replay: EpisodeRing, begin: int, steps: int, length: int = 7, observe: Observe = noise
 ) -> None:
-    """Timesteps `begin`, ...: the picture has the timestep's number, the action its step's."""
+    """Write timesteps `begin`, ...; image and action encode the number of the timestep."""
     for timestep in range(begin, begin + steps):
         if timestep % length == 0:
             replay.begin(observe(timestep))
@@ -58,7 +58,7 @@ def everything(replay: EpisodeRing) -> Batch:
 
 
 def assert_right(batch: Batch, newest: int) -> None:
-    """Step k led to timestep k; all up to the newest are there, and their pictures are theirs."""
+    """Check that the batch has all steps up to the newest, with the correct images."""
     timesteps = (batch.action[:, 0] * 1000).round().int().tolist()
     assert timesteps[-1] == newest
     assert timesteps == [m for m in range(timesteps[0], newest + 1) if m % 7]
@@ -80,14 +80,14 @@ def assert_same(one: Batch, other: Batch) -> None:
 
 
 @pytest.mark.parametrize("renderer", ["raster"])
-def test_it_gives_what_the_raw_one_gives(tmp_path: Path, renderer: str) -> None:
+def test_compressed_replay_equals_the_raw_one(tmp_path: Path, renderer: str) -> None:
     env = merl.make_env("move_box", renderer=renderer)
     space, actions = env.observation_space, env.action_space
     raw, packed = (
         EpisodeRing(config(capacity=200, compress=c), space, actions, directory=tmp_path / str(c))
         for c in (False, True)
     )
-    for episode in range(6):  # so that backgrounds change twice
+    for episode in range(6):  # so that the background changes twice
         observation, _ = env.reset(seed=episode)
         for replay in (raw, packed):
             replay.begin(observation)
@@ -106,7 +106,7 @@ def test_it_gives_what_the_raw_one_gives(tmp_path: Path, renderer: str) -> None:
     assert kept.mean() < 84 * 84 * 3 / 4
 
 
-def test_a_million_steps_take_at_most_six_gigabytes() -> None:
+def test_million_steps_take_at_most_six_gigabytes() -> None:
     env = merl.make_env("reach_duplo", renderer="raster")
     spaces_ = env.observation_space, env.action_space
     env.close()
@@ -114,7 +114,7 @@ def test_a_million_steps_take_at_most_six_gigabytes() -> None:
     assert replay_bytes(ReplayConfig(), *spaces_) <= 22e9  # type: ignore[arg-type]
 
 
-def test_pictures_that_take_more_than_is_reserved_cost_steps_and_are_told(
+def test_images_above_the_reserved_bytes_cost_steps_and_warn(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
@@ -122,14 +122,14 @@ def test_pictures_that_take_more_than_is_reserved_cost_steps_and_are_told(
         play(replay, timestep, 7)
         assert_right(everything(replay), timestep + 6)
     assert 10 < len(replay) < 30
-    told = "pictures take more bytes than --replay.compress reserves"
-    assert caplog.text.count(told) == 1
-    assert "a run with --replay.no-compress keeps all" in caplog.text
+    warning = "images take more bytes than --replay.compress reserves"
+    assert caplog.text.count(warning) == 1
+    assert "to keep all, start a run with --replay.no-compress" in caplog.text
 
 
 @pytest.mark.parametrize("capacity", [1, 2, 3, 5, 9])
 @pytest.mark.parametrize("frame_stack", [1, 3, 6])
-def test_even_the_smallest_has_a_step_to_learn_from(capacity: int, frame_stack: int) -> None:
+def test_smallest_replay_always_holds_a_step(capacity: int, frame_stack: int) -> None:
     settings = config(capacity=capacity, batch_size=1, frame_stack=frame_stack)
     replay = EpisodeRing(settings, NOISE, ACTIONS)
     for timestep in range(200):
@@ -143,7 +143,7 @@ def test_even_the_smallest_has_a_step_to_learn_from(capacity: int, frame_stack: 
             np.testing.assert_array_equal(batch.observation["image"][-1, -1], picture)
 
 
-def test_it_is_opened_again_as_it_was(tmp_path: Path) -> None:
+def test_reopened_replay_is_unchanged(tmp_path: Path) -> None:
     replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     for begin in range(0, 140, 10):
         play(replay, begin, 10)
@@ -152,14 +152,14 @@ def test_it_is_opened_again_as_it_was(tmp_path: Path) -> None:
         assert_same(everything(again), before)
 
 
-def test_it_goes_back_to_its_last_checkpoint_exactly(tmp_path: Path) -> None:
+def test_restoring_the_last_checkpoint_is_exact(tmp_path: Path) -> None:
     replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     play(replay, 0, 140)
     for begin in range(140, 280, 35):
         replay.flush()
         state, before = replay.state_dict(), everything(replay)
         replay.settle()
-        play(replay, begin, 40)  # most of what was held is overwritten, and the process dies
+        play(replay, begin, 40)  # overwrites most timesteps; then the process dies
         replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
         replay.load_state_dict(state)
         assert_same(everything(replay), before)
@@ -167,14 +167,14 @@ def test_it_goes_back_to_its_last_checkpoint_exactly(tmp_path: Path) -> None:
         assert_right(everything(replay), begin + 34)
 
 
-def test_a_picture_half_written_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_written_image_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     play(replay, 0, 144)
-    whole = CompressedPictures.write
+    write = CompressedPictures.write
 
-    def dies(pictures: CompressedPictures, slot: int, kept: bytes) -> None:
-        whole(pictures, slot, kept)
-        pictures._bytes(slot)[len(kept) // 2 :] = 0
+    def dies(pictures: CompressedPictures, slot: int, encoded: bytes) -> None:
+        write(pictures, slot, encoded)
+        pictures._bytes(slot)[len(encoded) // 2 :] = 0
         raise KeyboardInterrupt
 
     monkeypatch.setattr(CompressedPictures, "write", dies)
@@ -187,7 +187,7 @@ def test_a_picture_half_written_is_none(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("capacity", [62, 90, 300])
 @pytest.mark.parametrize("played", [35, 49, 63, 77, 140])
-def test_it_grows_where_its_bytes_have_wrapped(tmp_path: Path, capacity: int, played: int) -> None:
+def test_ring_whose_bytes_have_wrapped_grows(tmp_path: Path, capacity: int, played: int) -> None:
     replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     play(replay, 0, played)
     before = everything(replay)
@@ -201,7 +201,7 @@ def test_it_grows_where_its_bytes_have_wrapped(tmp_path: Path, capacity: int, pl
     assert len(again) > len(before.action) * min(capacity / 70, 1.2)
 
 
-def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> None:
+def test_background_is_the_common_part_of_images(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     still = rng.integers(0, 256, (8, 8, 3)).astype(np.uint8)
     file = tmp_path / "starts"
@@ -217,9 +217,9 @@ def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> 
         picture = still.copy()
         row, column = rng.integers(0, 6, 2)
         picture[row : row + 2, column : column + 2] = 255
-        kept = pictures.encode(picture)
-        pictures.write(number, kept)
-        sizes.append(len(kept))
+        encoded = pictures.encode(picture)
+        pictures.write(number, encoded)
+        sizes.append(len(encoded))
         pictures.backgrounds.begun(picture)
         ((decoded,),) = pictures.stacks(np.array([[number]]))
         np.testing.assert_array_equal(decoded, picture)
@@ -228,7 +228,7 @@ def test_the_background_is_what_most_pictures_have_in_common(tmp_path: Path) -> 
 
 
 def still_life(timestep: int) -> dict[str, np.ndarray]:
-    """A noisy wall, and something small before it that is elsewhere each time."""
+    """Return the image of a noisy wall with a small object at a random position."""
     picture = noise(0)["image"]
     row, column = np.random.default_rng(timestep).integers(0, SIDE - 3, 2)
     picture[row : row + 3, column : column + 3] = timestep % 256
@@ -236,7 +236,7 @@ def still_life(timestep: int) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("killed", [0, 2, 4, 15, 24, 30])
-def test_one_gone_back_to_its_checkpoint_keeps_the_same_steps_as_one_that_was_never_killed(
+def test_restored_replay_holds_the_same_steps_as_an_uninterrupted_one(
     tmp_path: Path, killed: int
 ) -> None:
     small = config(capacity=40)
@@ -258,7 +258,7 @@ def test_one_gone_back_to_its_checkpoint_keeps_the_same_steps_as_one_that_was_ne
         assert file.read_bytes() == (tmp_path / "killed" / file.name).read_bytes()
 
 
-def test_backgrounds_are_made_of_what_the_disk_took(
+def test_backgrounds_use_only_images_on_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     backgrounds = Backgrounds(4, tmp_path / "starts")
@@ -276,7 +276,7 @@ def test_backgrounds_are_made_of_what_the_disk_took(
     np.testing.assert_array_equal(again[2], np.median(pictures[[0, 2, 3, 4, 5]], axis=0))
 
 
-def test_pictures_whose_background_is_gone_are_refused(tmp_path: Path) -> None:
+def test_missing_background_is_rejected(tmp_path: Path) -> None:
     replay = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
     play(replay, 0, 49)
     state = replay.state_dict()
@@ -284,7 +284,7 @@ def test_pictures_whose_background_is_gone_are_refused(tmp_path: Path) -> None:
     whole = starts.read_bytes()
     starts.write_bytes(whole[:-1])
     again = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
-    with pytest.raises(MerlError, match=r"image\.starts holds 6 of the 7 pictures"):
+    with pytest.raises(MerlError, match=r"image\.starts holds 6 of the 7 images"):
         again.load_state_dict(state)
     starts.write_bytes(whole)
     again = EpisodeRing(config(), NOISE, ACTIONS, directory=tmp_path)
@@ -292,7 +292,7 @@ def test_pictures_whose_background_is_gone_are_refused(tmp_path: Path) -> None:
     assert_same(everything(again), everything(replay))
 
 
-def test_a_run_of_before_stays_with_the_backgrounds_that_it_kept(tmp_path: Path) -> None:
+def test_old_run_keeps_its_stored_backgrounds(tmp_path: Path) -> None:
     former = np.arange(8, dtype=np.uint8)
     former.tofile(tmp_path / "image.background")
     backgrounds = Backgrounds(4, tmp_path / "image.starts")

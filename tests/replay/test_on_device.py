@@ -1,4 +1,4 @@
-"""The copy of the replay on the device gives what the replay gives; here the device is the CPU."""
+"""The copy on the device gives the same samples as the replay; here the device is the CPU."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EPISODES = st.builds(Episode, st.integers(1, 9), st.sampled_from(["end", "limit"
 
 
 def writing(replay: EpisodeRing, number: int, episodes: list[Episode]) -> Iterator[None]:
-    """A timestep at a time."""
+    """Write the episodes, one timestep per iteration."""
     account = Account(replay.config)
     for index, plan in enumerate(episodes):
         for t in range(plan.length + 1):
@@ -36,33 +36,35 @@ def tensors(batch: Batch) -> dict[str, torch.Tensor]:
 
 
 def check(copy: OnDevice, rings: list[EpisodeRing]) -> None:
-    """Every step of every ring, as the ring itself gives it."""
+    """Compare every step of every ring in the copy with the ring itself."""
     for number, ring in enumerate(rings):
         if not len(ring):
             continue
         first, steps, _ = ring.counts()
-        there = copy.at(torch.full((steps - first,), number), torch.arange(first, steps))
+        found = copy.at(torch.full((steps - first,), number), torch.arange(first, steps))
         expected = tensors(ring.sample(1, Every()))  # type: ignore[arg-type]
-        for name, value in tensors(there).items():
+        for name, value in tensors(found).items():
             assert torch.equal(value, expected[name]), name
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=list(HealthCheck))
 @given(st.lists(st.lists(EPISODES, min_size=1, max_size=9), min_size=1, max_size=3), st.data())
-def test_it_gives_what_the_rings_give(plans: list[list[Episode]], data: st.DataObject) -> None:
+def test_copy_gives_the_same_samples_as_the_rings(
+    plans: list[list[Episode]], data: st.DataObject
+) -> None:
     stack, n_step = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 4))
     rings = [make(frame_stack=stack, n_step=n_step) for _ in plans]
     copy = OnDevice(rings, torch.device("cpu"))
-    todo = [
+    writers = [
         writing(ring, number, plan)
         for number, (ring, plan) in enumerate(zip(rings, plans, strict=True))
     ]
     every = data.draw(st.integers(1, 40))
     timestep = 0
-    while todo:
-        for one in list(todo):
-            if next(one, "over") == "over":
-                todo.remove(one)
+    while writers:
+        for writer in list(writers):
+            if next(writer, "done") == "done":
+                writers.remove(writer)
         timestep += 1
         if timestep % every == 0:
             copy.follow()
@@ -71,7 +73,7 @@ def test_it_gives_what_the_rings_give(plans: list[list[Episode]], data: st.DataO
     check(copy, rings)
 
 
-def test_a_long_absence_is_made_up_in_pieces() -> None:
+def test_many_new_slots_are_copied_in_chunks() -> None:
     rings = [make(capacity=3 * CHUNK)]
     for _ in writing(rings[0], 0, [Episode(50, "limit")] * 300):
         pass
@@ -94,12 +96,12 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
     held = [tuple(row) for ring in rings for row in ring.sample(1, Every()).action.tolist()]  # type: ignore[arg-type]
     assert sorted(map(tuple, drawn.tolist())) == sorted(held)
     assert len(held) == 25
-    # A chi-squared of 24 degrees of freedom exceeds 52 once in a thousand.
+    # A chi-squared with 24 degrees of freedom exceeds 52 with probability 0.001.
     assert ((often - 2000.0) ** 2 / 2000.0).sum() < 52
 
 
-def test_what_memory_held_before_is_never_learnt_from() -> None:
-    """A card's memory is not empty when the copy takes it, and may hold what is no number."""
+def test_uninitialised_memory_does_not_reach_a_batch() -> None:
+    """The copy's memory on a GPU is not initialised, and may hold NaN."""
     ring = make(capacity=50)
     copy = OnDevice([ring], torch.device("cpu"))
     for field in copy._fields.values():
@@ -110,23 +112,23 @@ def test_what_memory_held_before_is_never_learnt_from() -> None:
         check(copy, [ring])
 
 
-def test_a_draw_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a device without values: what asked for one, or lay elsewhere, would raise."""
-    ring, card, rand = make(capacity=20), torch.device("meta"), torch.rand
+def test_sampling_does_not_wait_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On device `meta`, reading a value or using a tensor on another device raises an error."""
+    ring, device, rand = make(capacity=20), torch.device("meta"), torch.rand
     for _ in writing(ring, 0, [Episode(30, "limit")]):
         pass
-    copy = OnDevice([ring], card)
+    copy = OnDevice([ring], device)
     copy.follow()
     monkeypatch.setattr(torch, "rand", lambda *a, generator, **k: rand(*a, **k))
     drawn = tensors(copy.sample(5, torch.Generator()))
     expected = tensors(ring.sample(5, np.random.default_rng(0)))
     for name, value in drawn.items():
-        assert (value.device, value.dtype) == (card, expected[name].dtype)
+        assert (value.device, value.dtype) == (device, expected[name].dtype)
         assert value.shape == expected[name].shape
 
 
-def test_rings_that_have_grown_by_different_amounts(tmp_path: Path) -> None:
-    """One has come round, the other not; both are opened with a larger capacity."""
+def test_rings_of_different_lengths_after_growth(tmp_path: Path) -> None:
+    """One ring has wrapped, the other has not; both are opened with a larger capacity."""
     rings, plans = [], [[Episode(6, "end")] * 5, [Episode(8, "limit")]]
     for number, plan in enumerate(plans):
         ring = make(tmp_path / str(number))

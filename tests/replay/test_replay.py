@@ -1,4 +1,4 @@
-"""Replay against a brute-force account of what was written, and what it does to the disk."""
+"""Replay against a brute-force model of its contents; its files, errors, resuming and growth."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def make(directory: Path | None = None, **values: Any) -> EpisodeRing:
 
 
 def observe(episode: int, t: int) -> dict[str, np.ndarray]:
-    """What is seen at timestep t of an episode; no two timesteps and no two pixels are alike."""
+    """Return the observation at timestep t of an episode; timesteps and pixels differ."""
     seen: dict[str, np.ndarray] = {}
     for salt, (key, shape) in enumerate(IMAGES.items()):
         pixels = np.arange(np.prod(shape), dtype=np.int64).reshape(shape)
@@ -62,22 +62,22 @@ def observe(episode: int, t: int) -> dict[str, np.ndarray]:
 
 
 def act(episode: int, t: int) -> np.ndarray:
-    """The action of step t, which tells the step."""
+    """Return the action of step t, which identifies the step."""
     return np.array([episode, t], np.float32)
 
 
-def pay(episode: int, t: int) -> float:
+def reward_of(episode: int, t: int) -> float:
     return float(np.float32(np.sin(1 + episode * 13.7 + t * 3.1)))
 
 
 @dataclass
 class Episode:
     length: int
-    ending: str  # "end": truly over, "limit": truncated, "cut": never said to be over
+    ending: str  # "end": a true end, "limit": truncated, "cut": not ended before the next
 
 
 class Every:
-    """Stands in for a random generator: each step that can be drawn comes once, in order."""
+    """Replacement of a random generator that draws each possible step once, in order."""
 
     def integers(self, low: int, high: int, size: int) -> np.ndarray:
         return np.arange(low, high)
@@ -85,13 +85,15 @@ class Every:
 
 @dataclass
 class Account:
-    """What a replay must do, told as plainly as can be: lists, loops, one row at a time."""
+    """Simple model of the required behaviour of a replay: lists, loops, one row at a time."""
 
     config: ReplayConfig
-    timesteps: list[tuple[int, int]] = field(default_factory=list)  # (episode, t), all ever written
+    timesteps: list[tuple[int, int]] = field(
+        default_factory=list
+    )  # (episode, t) of all ever written
     ended: set[int] = field(default_factory=set)  # episodes that truly ended
-    lost: int = 0  # so many of the oldest timesteps are overwritten
-    length: int = 0  # slots, if they are more than the capacity asks for
+    lost: int = 0  # number of oldest timesteps that are overwritten
+    length: int = 0  # number of slots, if it is more than the capacity requires
 
     @property
     def slots(self) -> int:
@@ -103,12 +105,12 @@ class Account:
             config.capacity + config.capacity // 200 + config.frame_stack, least
         )
 
-    def see(self, episode: int, t: int) -> None:
+    def record(self, episode: int, t: int) -> None:
         self.timesteps.append((episode, t))
         self.lost = max(self.lost, len(self.timesteps) - self.slots)
 
     def held(self) -> list[tuple[int, int]]:
-        """The steps that must be sampled: the newest, with all of their stack."""
+        """Return the steps that must be sampled: the newest ones with a complete stack."""
         alive = set(self.timesteps[self.lost :])
         steps = [a for a, b in pairwise(self.timesteps) if b == (a[0], a[1] + 1)]
         whole = [(e, t) for e, t in steps if all(frame in alive for frame in self.stack(e, t))]
@@ -118,11 +120,11 @@ class Account:
         return [(episode, max(0, t - back)) for back in reversed(range(self.config.frame_stack))]
 
     def row(self, episode: int, t: int) -> tuple[float, float, int]:
-        """Return, discount and the timestep that the return bootstraps from."""
+        """Compute return, discount, and the timestep from which the return bootstraps."""
         last = max(s for e, s in self.timesteps if e == episode)
         total, weight = 0.0, 1.0
         for _ in range(self.config.n_step):
-            total += weight * pay(episode, t)
+            total += weight * reward_of(episode, t)
             weight *= self.config.discount
             t += 1
             if t == last:
@@ -131,23 +133,23 @@ class Account:
 
 
 def write(replay: EpisodeRing, account: Account, episode: int, t: int, plan: Episode) -> None:
-    """Timestep t of an episode, into both."""
+    """Write timestep t of an episode to the replay and to the account."""
     if t == 0:
         replay.begin(observe(episode, 0))
     else:
         last = t == plan.length and plan.ending != "cut"
         ends = last and plan.ending == "end"
         step = Transition(
-            act(episode, t - 1), pay(episode, t - 1), 1.0 - ends, observe(episode, t), last
+            act(episode, t - 1), reward_of(episode, t - 1), 1.0 - ends, observe(episode, t), last
         )
         replay.add(step)
         if ends:
             account.ended.add(episode)
-    account.see(episode, t)
+    account.record(episode, t)
 
 
 def check(replay: EpisodeRing, account: Account) -> None:
-    """All that the replay can sample is what the account says, each step once."""
+    """Compare all steps that the replay can sample with the account."""
     held = account.held()
     assert len(replay) == len(held)
     if held:
@@ -192,26 +194,26 @@ def brute_force(settings: ReplayConfig, episodes: list[Episode]) -> None:
     for episode, plan in enumerate(episodes):
         for t in range(plan.length + 1):
             write(replay, account, episode, t, plan)
-            check(replay, account)  # so at every offset of the write head
+            check(replay, account)  # at every position of the next slot
 
 
 @settings(max_examples=60, deadline=None)
 @given(configs, plans)
-def test_every_sample_is_what_brute_force_makes_of_it(config, episodes):
+def test_every_sample_equals_the_brute_force_model(config, episodes):
     brute_force(config, episodes)
 
 
 @pytest.mark.long
 @settings(max_examples=600, deadline=None)
 @given(configs, plans)
-def test_every_sample_is_what_brute_force_makes_of_it_long(config, episodes):
+def test_every_sample_equals_the_brute_force_model_long(config, episodes):
     brute_force(config, episodes)
 
 
 @pytest.mark.parametrize(
     ("ending", "rewards", "discounts", "ends"),
     [
-        # rewards 1, 2, 4, 8; gamma 1/2; three steps
+        # rewards 1, 2, 4, 8; gamma 1/2; n = 3
         ("end", [1 + 1 + 1, 2 + 2 + 2, 4 + 4, 8], [1 / 8, 0, 0, 0], [3, 4, 4, 4]),
         ("limit", [3, 6, 8, 8], [1 / 8, 1 / 8, 1 / 4, 1 / 2], [3, 4, 4, 4]),
         ("cut", [3, 6, 8, 8], [1 / 8, 1 / 8, 1 / 4, 1 / 2], [3, 4, 4, 4]),
@@ -222,9 +224,9 @@ def test_returns_computed_by_hand(ending, rewards, discounts, ends):
     replay = make(discount=0.5)
     replay.begin(observe(0, 0))
     for t, reward in enumerate([1, 2, 4, 8]):
-        over = t == 3 and ending in ("end", "limit")
-        discount = 0.0 if over and ending == "end" else 1.0
-        replay.add(Transition(act(0, t), reward, discount, observe(0, t + 1), over))
+        last = t == 3 and ending in ("end", "limit")
+        discount = 0.0 if last and ending == "end" else 1.0
+        replay.add(Transition(act(0, t), reward, discount, observe(0, t + 1), last))
     if ending != "in progress":
         replay.begin(observe(1, 0))
         replay.add(Transition(act(1, 0), 1000.0, 1.0, observe(1, 1), last=False))
@@ -234,7 +236,7 @@ def test_returns_computed_by_hand(ending, rewards, discounts, ends):
     assert batch.next_observation["joints"][:4, 0].tolist() == [10.0 * t for t in ends]
 
 
-def test_the_batch_has_the_types_and_shapes_of_the_contract():
+def test_batch_has_the_documented_types_and_shapes():
     replay, account = make(), Account(config())
     for t in range(11):
         write(replay, account, 0, t, Episode(10, "end"))
@@ -251,7 +253,7 @@ def test_the_batch_has_the_types_and_shapes_of_the_contract():
     assert {batch.action.dtype, batch.reward.dtype, batch.discount.dtype} == {torch.float32}
 
 
-def test_a_batch_is_the_callers_own():
+def test_later_writes_do_not_change_a_batch():
     replay, account = make(capacity=4), Account(config(capacity=4))
     for t in range(5):
         write(replay, account, 0, t, Episode(50, "end"))
@@ -263,7 +265,7 @@ def test_a_batch_is_the_callers_own():
     assert torch.equal(batch.observation["front"], kept)
 
 
-def test_the_same_generator_and_content_give_the_same_batch():
+def test_same_generator_and_contents_give_the_same_batch():
     replay, account = make(), Account(config())
     for t in range(15):
         write(replay, account, 0, t, Episode(50, "end"))
@@ -275,47 +277,47 @@ def test_the_same_generator_and_content_give_the_same_batch():
 
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("n_step", [3, 6])
-def test_what_is_read_ahead_holds_the_batch_and_no_more(tmp_path, monkeypatch, compress, n_step):
-    """With n_step 6 the pictures between o_t and o_{t+n} are left out."""
+def test_read_ahead_requests_exactly_the_batch(tmp_path, monkeypatch, compress, n_step):
+    """With n_step 6 the images between o_t and o_{t+n} are not requested."""
     replay = make(tmp_path / "ring", capacity=30, compress=compress, n_step=n_step)
     account = Account(replay.config)
-    for episode in range(9):  # it wraps
+    for episode in range(9):  # the ring wraps
         for t in range(8):
             write(replay, account, episode, t, Episode(7, "limit"))
-    asked, indices, pick = [], [], replay._sampler.pick
-    monkeypatch.setattr(replay._ahead, "ask", lambda _, *stretch: asked.append(stretch))
+    requested, indices, pick = [], [], replay._sampler.pick
+    monkeypatch.setattr(replay._ahead, "ask", lambda _, *stretch: requested.append(stretch))
     replay.sample(1, Every())
-    assert not asked  # all of it is in memory
+    assert not requested  # all images are in memory
     monkeypatch.setattr(ReadAhead, "is_wanted", True)
     replay._sampler.pick = lambda *a, **k: (indices.append(pick(*a, **k)), indices[0])[1]
     replay.sample(1, Every())
     now, then = indices[0].now, indices[0].then
     parts = [torch.cat([now, then], dim=1)] if n_step == 3 else [now, then]
     wanted = [(part.numpy(), *image) for part in parts for image in IMAGES.items()]
-    for (slots, key, shape), (begin, end) in zip(wanted, asked, strict=True):
+    for (slots, key, shape), (begin, end) in zip(wanted, requested, strict=True):
         name, size = replay.keys[key], math.prod(shape)
         at, count = slots * size, size
         if compress:
             at, count = np.moveaxis(replay._data[f"{name}.span"][slots], -1, 0)
             at = at % len(replay._compressed[name]._ring)
-        in_one_piece = end > begin
-        assert in_one_piece.mean() > 0.5
-        assert compress or n_step == 6 or not in_one_piece.all()
-        assert (begin[:, None] <= at)[in_one_piece].all()
-        assert (at + count <= end[:, None])[in_one_piece].all()
-        assert (end - begin)[in_one_piece].max() <= slots.shape[1] * (size + 64 * compress)
+        contiguous = end > begin
+        assert contiguous.mean() > 0.5
+        assert compress or n_step == 6 or not contiguous.all()
+        assert (begin[:, None] <= at)[contiguous].all()
+        assert (at + count <= end[:, None])[contiguous].all()
+        assert (end - begin)[contiguous].max() <= slots.shape[1] * (size + 64 * compress)
 
 
-def test_it_is_asked_for_some_time_after_pages_were_waited_for(monkeypatch):
-    waited = 0
-    monkeypatch.setattr(pictures, "_pages_waited_for", lambda: waited)
+def test_read_ahead_is_active_for_some_batches_after_page_faults(monkeypatch):
+    faults = 0
+    monkeypatch.setattr(pictures, "_major_page_faults", lambda: faults)
     ahead = ReadAhead()
 
     def batch(pages):
-        nonlocal waited
+        nonlocal faults
         wanted = ahead.is_wanted
         ahead.begin()
-        waited += pages
+        faults += pages
         ahead.end()
         return wanted
 
@@ -325,7 +327,7 @@ def test_it_is_asked_for_some_time_after_pages_were_waited_for(monkeypatch):
     assert [batch(9) for _ in range(500)] == [True] * 500
 
 
-def test_pictures_that_are_on_the_disk_alone_are_fetched(tmp_path):
+def test_read_ahead_reads_the_requested_pages_from_disk(tmp_path):
     pages = 300
     with (tmp_path / "pictures").open("w+b") as file:
         file.write(bytes(pages * mmap.PAGESIZE))
@@ -341,18 +343,18 @@ def test_pictures_that_are_on_the_disk_alone_are_fetched(tmp_path):
 
 
 def in_memory(mapped: mmap.mmap) -> set[int]:
-    """The pages of a file that need not be read from the disk."""
+    """Return the pages of a file that are in memory."""
     held = np.frombuffer(mapped, np.uint8)
-    told = np.zeros(-(-len(held) // mmap.PAGESIZE), np.uint8)
+    flags = np.zeros(-(-len(held) // mmap.PAGESIZE), np.uint8)
     place, size = ctypes.c_void_p(held.ctypes.data), ctypes.c_size_t(len(held))
-    assert ctypes.CDLL(None).mincore(place, size, ctypes.c_void_p(told.ctypes.data)) == 0
-    return set(np.flatnonzero(told & 1).tolist())
+    assert ctypes.CDLL(None).mincore(place, size, ctypes.c_void_p(flags.ctypes.data)) == 0
+    return set(np.flatnonzero(flags & 1).tolist())
 
 
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("count", [1, 3])
-def test_frames_are_copied_as_it_is_told(compress, count):
-    """What is made of a stack meets the stack, its place and its number in the batch."""
+def test_frame_transforms_are_applied_to_each_sample(compress, count):
+    """A transform receives the sample's number in the batch, its stack, and its output array."""
     rings = ReplayBuffer(config(capacity=90, compress=compress), OBSERVATIONS, ACTIONS, count=count)
     for number, ring in enumerate(rings.rings):
         account = Account(ring.config)
@@ -360,21 +362,21 @@ def test_frames_are_copied_as_it_is_told(compress, count):
             for t in range(9):
                 write(ring, account, 10 * number + episode, t, Episode(8, "limit"))
     plain = rings.sample(50, np.random.default_rng(3))
-    told = []
+    samples = []
 
-    def mirrored(sample, frames, out):
-        told.append(sample)
+    def inverted(sample, frames, out):
+        samples.append(sample)
         out[:] = 255 - frames
 
     batch = rings.sample(
-        50, np.random.default_rng(3), {"front": mirrored}, {"wrist/left": mirrored}
+        50, np.random.default_rng(3), {"front": inverted}, {"wrist/left": inverted}
     )
-    assert sorted(told) == sorted([*range(50), *range(50)])
+    assert sorted(samples) == sorted([*range(50), *range(50)])
     assert torch.equal(batch.observation["front"], 255 - plain.observation["front"])
     assert torch.equal(batch.observation["wrist/left"], plain.observation["wrist/left"])
     assert torch.equal(batch.next_observation["front"], plain.next_observation["front"])
-    mirror = 255 - plain.next_observation["wrist/left"]
-    assert torch.equal(batch.next_observation["wrist/left"], mirror)
+    expected = 255 - plain.next_observation["wrist/left"]
+    assert torch.equal(batch.next_observation["wrist/left"], expected)
     assert torch.equal(batch.reward, plain.reward)
 
 
@@ -385,17 +387,17 @@ def test_every_step_is_drawn_equally_often():
         for t in range(length + 1):
             write(replay, account, episode, t, Episode(length, "end"))
     held = account.held()
-    assert 0 < len(held) < sum(lengths)  # it has wrapped
+    assert 0 < len(held) < sum(lengths)  # the ring has wrapped
     draws = 2000 * len(held)
     actions = replay.sample(draws, np.random.default_rng(1)).action.tolist()
     counts = dict.fromkeys(held, 0)
     for row in actions:
         counts[tuple(row)] += 1
     chi_square = sum((count - 2000) ** 2 / 2000 for count in counts.values())
-    assert chi_square < 2.5 * len(held)  # its mean is len(held) - 1; this lies above 99.99 %
+    assert chi_square < 2.5 * len(held)  # the mean is len(held) - 1; the bound is above 99.99 %
 
 
-def test_it_keeps_all_of_its_capacity_and_no_more():
+def test_replay_holds_exactly_its_capacity():
     settings = config(capacity=1000)
     replay, account = EpisodeRing(settings, OBSERVATIONS, ACTIONS), Account(settings)
     for episode in range(6):
@@ -405,11 +407,11 @@ def test_it_keeps_all_of_its_capacity_and_no_more():
     check(replay, account)
 
 
-# Going back and opening again
+# Restoring a state, and opening again
 
 
 class Run:
-    """A replay in a directory and its account, driven together."""
+    """A replay in a directory and its account, which are written together."""
 
     def __init__(self, directory: Path, **values: Any) -> None:
         self.directory, self.values = directory, values
@@ -423,13 +425,13 @@ class Run:
             for t in range(length + 1):
                 write(self.replay, self.account, self.episode, t, Episode(length, ending))
 
-    def go_back(self, state: dict[str, Any], timesteps: int) -> None:
+    def restore(self, state: dict[str, Any], timesteps: int) -> None:
         del self.account.timesteps[timesteps:]
         self.replay = make(self.directory, **self.values)
         self.replay.load_state_dict(state)
 
 
-def test_opened_again_it_holds_all_that_was_written(tmp_path):
+def test_reopened_replay_holds_all_data(tmp_path):
     run = Run(tmp_path / "replay")
     run.play(5, 4, 6)
     run.play(3, ending="cut")
@@ -441,7 +443,7 @@ def test_opened_again_it_holds_all_that_was_written(tmp_path):
     check(run.replay, run.account)
 
 
-def test_opened_again_after_wrapping(tmp_path):
+def test_reopened_replay_holds_all_data_after_wrapping(tmp_path):
     run = Run(tmp_path / "replay")
     for length in range(9):
         run.play(length)
@@ -449,18 +451,18 @@ def test_opened_again_after_wrapping(tmp_path):
         check(run.replay, run.account)
 
 
-def test_going_on_from_a_state_is_as_if_nothing_had_happened(tmp_path):
+def test_restored_replay_equals_an_uninterrupted_one(tmp_path):
     plain, broken = Run(tmp_path / "plain"), Run(tmp_path / "broken")
     for run in (plain, broken):
         run.play(5, 4, 6, 8)
-    # A few steps more, and the process dies.
+    # Write a few more steps; then the process dies.
     state, timesteps = (
         json.loads(json.dumps(broken.replay.state_dict())),
         len(broken.account.timesteps),
     )
     episode = broken.episode
     broken.play(1)
-    broken.go_back(state, timesteps)
+    broken.restore(state, timesteps)
     broken.episode = episode
     assert broken.replay.state_dict() == plain.replay.state_dict()
     for run in (plain, broken):
@@ -472,27 +474,27 @@ def test_going_on_from_a_state_is_as_if_nothing_had_happened(tmp_path):
     assert torch.equal(one.observation["front"], two.observation["front"])
 
 
-def test_an_episode_in_progress_goes_on_from_its_state(tmp_path):
+def test_restored_episode_in_progress_continues(tmp_path):
     run = Run(tmp_path / "replay")
     run.play(5)
     run.play(3, ending="cut")
     run.replay.flush()
-    run.go_back(run.replay.state_dict(), len(run.account.timesteps))
+    run.restore(run.replay.state_dict(), len(run.account.timesteps))
     write(run.replay, run.account, 1, 4, Episode(4, "end"))
     check(run.replay, run.account)
 
 
-def go_back_anywhere(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
-    """Save somewhere, write on, go back, write on again: whatever is held then is right."""
+def restore_anywhere(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
+    """Save at some step, write, restore, write again: the contents are always correct."""
     replay, account = EpisodeRing(settings, OBSERVATIONS, ACTIONS), Account(settings)
     state, saved = replay.state_dict(), 0
     for episode, plan in enumerate(episodes):
         for t in range(plan.length + 1):
             write(replay, account, episode, t, plan)
-        move = data.draw(st.sampled_from(["go on", "save", "go back"]))
+        move = data.draw(st.sampled_from(["continue", "save", "restore"]))
         if move == "save":
             state, saved = replay.state_dict(), len(account.timesteps)
-        elif move == "go back" and saved > account.lost:
+        elif move == "restore" and saved > account.lost:
             replay.load_state_dict(state)
             del account.timesteps[saved:]
         check(replay, account)
@@ -500,19 +502,19 @@ def go_back_anywhere(settings: ReplayConfig, episodes: list[Episode], data: st.D
 
 @settings(max_examples=60, deadline=None)
 @given(configs, plans, st.data())
-def test_going_back_anywhere(config, episodes, data):
-    go_back_anywhere(config, episodes, data)
+def test_restoring_at_any_time(config, episodes, data):
+    restore_anywhere(config, episodes, data)
 
 
 @pytest.mark.long
 @settings(max_examples=600, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(configs, plans, st.data())
-def test_going_back_anywhere_long(config, episodes, data):
-    go_back_anywhere(config, episodes, data)
+def test_restoring_at_any_time_long(config, episodes, data):
+    restore_anywhere(config, episodes, data)
 
 
-def go_back_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
-    """Save, write on, die at any time, go back: all that was held at the save is held again."""
+def restore_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
+    """Save, write, die at any time, restore: the replay holds the same steps as at the save."""
     with tempfile.TemporaryDirectory() as folder:
         replay = EpisodeRing(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
         account = Account(settings)
@@ -520,7 +522,7 @@ def go_back_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.Da
         for episode, plan in enumerate(episodes):
             for t in range(plan.length + 1):
                 write(replay, account, episode, t, plan)
-            move = data.draw(st.sampled_from(["go on", "save", "save and die", "die"]))
+            move = data.draw(st.sampled_from(["continue", "save", "save and die", "die"]))
             if move.startswith("save"):
                 replay.flush()
                 state, saved, lost = replay.state_dict(), len(account.timesteps), account.lost
@@ -536,18 +538,18 @@ def go_back_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.Da
 
 @settings(max_examples=40, deadline=None)
 @given(configs, plans, st.data())
-def test_going_back_exactly(config, episodes, data):
-    go_back_exactly(config, episodes, data)
+def test_restoring_after_a_crash_is_exact(config, episodes, data):
+    restore_exactly(config, episodes, data)
 
 
 @pytest.mark.long
 @settings(max_examples=600, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(configs, plans, st.data())
-def test_going_back_exactly_long(config, episodes, data):
-    go_back_exactly(config, episodes, data)
+def test_restoring_after_a_crash_is_exact_long(config, episodes, data):
+    restore_exactly(config, episodes, data)
 
 
-def test_a_full_disk_costs_the_journal_and_no_more(tmp_path, caplog):
+def test_full_disk_stops_the_journal_but_not_the_replay(tmp_path, caplog):
     class Full:
         def __init__(self, file):
             self.file = file
@@ -566,29 +568,29 @@ def test_a_full_disk_costs_the_journal_and_no_more(tmp_path, caplog):
     run.replay._journal._file = Full(run.replay._journal._file)
     run.play(9, 2)
     assert caplog.text.count("the disk is full") == 1
-    run.go_back(state, timesteps)  # to what the ring itself still holds
+    run.restore(state, timesteps)  # only steps that the ring still holds
     check(run.replay, run.account)
     assert 0 < len(run.replay) < 18
 
 
-def test_what_came_after_a_state_does_not_come_back(tmp_path):
+def test_steps_after_a_restored_state_are_discarded(tmp_path):
     run = Run(tmp_path / "replay")
     run.play(4)
     state, timesteps = run.replay.state_dict(), len(run.account.timesteps)
     run.play(9)
-    run.go_back(state, timesteps)
-    run.play(2, ending="cut")  # ends within what was written before
+    run.restore(state, timesteps)
+    run.play(2, ending="cut")  # ends among timesteps that were written before
     run.replay = make(run.directory)
     check(run.replay, run.account)
 
 
-def test_a_timestep_half_written_is_none(tmp_path):
+def test_half_written_timestep_is_ignored(tmp_path):
     class Dies:
         def __setitem__(self, slot: int, value: float) -> None:
             raise KeyboardInterrupt
 
     run = Run(tmp_path / "replay")
-    run.play(30, ending="cut")  # so that an older timestep lies where the next will
+    run.play(30, ending="cut")  # so that the next timestep overwrites an older one
     run.replay._data["reward"] = Dies()
     with pytest.raises(KeyboardInterrupt):
         run.replay.add(Transition(act(0, 30), 0.0, 1.0, observe(0, 31), last=False))
@@ -597,19 +599,17 @@ def test_a_timestep_half_written_is_none(tmp_path):
     check(run.replay, run.account)
 
 
-def test_a_state_that_is_not_held_is_refused(tmp_path):
+def test_state_of_another_replay_is_rejected(tmp_path):
     run = Run(tmp_path / "replay")
     run.play(5)
     state = run.replay.state_dict()
     with pytest.raises(MerlError, match="does not hold timestep 6"):
         make().load_state_dict(state)
-    check(run.replay, run.account)  # and nothing has changed
+    check(run.replay, run.account)  # nothing has changed
 
 
-def test_a_state_that_was_overwritten_and_not_kept_leaves_the_newer_steps(
-    tmp_path, monkeypatch, caplog
-):
-    """As on a disk that was full from the last checkpoint to the end."""
+def test_overwritten_state_without_journal_keeps_the_newer_steps(tmp_path, monkeypatch, caplog):
+    """This happens if the disk was full from the last checkpoint on."""
     run = Run(tmp_path / "replay")
     run.play(5)
     state = run.replay.state_dict()
@@ -618,12 +618,12 @@ def test_a_state_that_was_overwritten_and_not_kept_leaves_the_newer_steps(
     run.play(20, 20)
     for ring in (run.replay, make(run.directory)):
         ring.load_state_dict(state)
-        assert "has overwritten what it held at the checkpoint" in caplog.text
+        assert "has overwritten timesteps of the checkpoint" in caplog.text
         check(ring, run.account)
         caplog.clear()
 
 
-def test_it_grows_when_opened_with_a_larger_capacity(tmp_path):
+def test_ring_grows_if_opened_with_a_larger_capacity(tmp_path):
     run = Run(tmp_path / "replay")
     run.play(5, 4, 6)
     run.values["capacity"] = 50
@@ -635,7 +635,7 @@ def test_it_grows_when_opened_with_a_larger_capacity(tmp_path):
 
 
 def lengthen(run: Run, capacity: int) -> None:
-    """Open it again, with a larger capacity."""
+    """Open the replay of a run again, with a larger capacity."""
     before, held = run.replay.ring_index.length, run.account.held()
     run.values["capacity"] = capacity
     run.account.config = config(**run.values)
@@ -647,8 +647,8 @@ def lengthen(run: Run, capacity: int) -> None:
 
 @pytest.mark.parametrize("capacity", [28, 29, 60])
 @pytest.mark.parametrize("compress", [False, True])
-def test_a_ring_that_has_wrapped_grows_too(tmp_path, capacity, compress):
-    for more in range(0, 25, 4):  # wherever it stands
+def test_wrapped_ring_grows(tmp_path, capacity, compress):
+    for more in range(0, 25, 4):  # at several positions of the next slot
         run = Run(tmp_path / str(more), compress=compress)
         run.play(9, 9, 9, 0)
         run.play(more)
@@ -665,7 +665,7 @@ def test_a_ring_that_has_wrapped_grows_too(tmp_path, capacity, compress):
 
 
 @pytest.mark.parametrize("compress", [False, True])
-def test_it_grows_and_goes_back_to_its_last_checkpoint(tmp_path, compress):
+def test_grown_ring_restores_its_last_checkpoint(tmp_path, compress):
     for more in (0, 2, 5, 9):
         run = Run(tmp_path / str(more), compress=compress)
         run.play(9, 9, 9, 5)
@@ -676,10 +676,10 @@ def test_it_grows_and_goes_back_to_its_last_checkpoint(tmp_path, compress):
             run.account.lost,
         )
         run.replay.settle()
-        run.play(*[2] * more)  # what was held is overwritten, and the process dies
+        run.play(*[2] * more)  # overwrites older timesteps; then the process dies
         run.values["capacity"] = 50
         run.account.config = config(**run.values)
-        run.go_back(state, timesteps)
+        run.restore(state, timesteps)
         run.account.length, run.account.lost = run.replay.ring_index.length, lost
         check(run.replay, run.account)
         run.play(*[9] * 8)
@@ -688,8 +688,8 @@ def test_it_grows_and_goes_back_to_its_last_checkpoint(tmp_path, compress):
 
 @pytest.mark.parametrize("killed", [False, True])
 @pytest.mark.parametrize("at", [0, 1, 5])
-def test_what_dies_while_it_grows_is_as_it_was(tmp_path, monkeypatch, at, killed):
-    """By an exception, or at once, with no time to tidy up; however far the files have come."""
+def test_failed_growth_keeps_the_old_contents(tmp_path, monkeypatch, at, killed):
+    """Growth stops at several points, by an exception or by a kill without any cleanup."""
     run = Run(tmp_path)
     run.play(9, 9, 4)
     moved = 0
@@ -714,7 +714,7 @@ def test_what_dies_while_it_grows_is_as_it_was(tmp_path, monkeypatch, at, killed
     check(run.replay, run.account)
 
 
-def test_opened_with_a_smaller_capacity_it_samples_only_the_newest(tmp_path):
+def test_smaller_capacity_samples_only_the_newest_steps(tmp_path):
     run = Run(tmp_path / "replay")
     run.play(5, 4, 6)
     replay = make(run.directory, capacity=7)
@@ -722,7 +722,7 @@ def test_opened_with_a_smaller_capacity_it_samples_only_the_newest(tmp_path):
     steps = run.account.held()[-7:]
     check_rows(replay.sample(7, Every()), run.account, steps)
     run.replay = make(run.directory)
-    check(run.replay, run.account)  # and nothing is lost
+    check(run.replay, run.account)  # no data is lost
 
 
 # Disk and memory
@@ -732,7 +732,7 @@ def files(directory: Path) -> list[Path]:
     return sorted(directory.glob("*.bin"))
 
 
-def test_a_step_takes_at_most_21_6_kilobytes(tmp_path):
+def test_step_takes_at_most_21_6_kilobytes(tmp_path):
     observations = gymnasium.spaces.Dict(
         {
             "image": gymnasium.spaces.Box(0, 255, (84, 84, 3), np.uint8),
@@ -755,7 +755,7 @@ def test_a_step_takes_at_most_21_6_kilobytes(tmp_path):
     assert million <= 21_600 * 1_000_000
 
 
-def test_its_files_are_laid_out_as_documented(tmp_path):
+def test_files_have_the_documented_layout(tmp_path):
     run = Run(tmp_path)
     run.play(3)
     header = json.loads((tmp_path / "replay.json").read_text())
@@ -773,12 +773,12 @@ def assert_reserved(directory: Path) -> None:
         assert status.st_blocks * 512 >= status.st_size > 0, file
 
 
-def test_its_space_is_reserved_before_it_is_used(tmp_path):
+def test_disk_space_is_reserved_before_use(tmp_path):
     make(tmp_path / "replay", capacity=5000)
     assert_reserved(tmp_path / "replay")
 
 
-def test_space_is_reserved_by_zeros_where_the_file_system_cannot(tmp_path, monkeypatch):
+def test_disk_space_is_reserved_with_zeros_without_fallocate(tmp_path, monkeypatch):
     def refuse(*_: int) -> None:
         raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
 
@@ -789,7 +789,7 @@ def test_space_is_reserved_by_zeros_where_the_file_system_cannot(tmp_path, monke
     check(run.replay, run.account)
 
 
-def test_a_disk_that_runs_full_leaves_nothing_behind(tmp_path, monkeypatch):
+def test_full_disk_leaves_no_files(tmp_path, monkeypatch):
     reserve, calls = os.posix_fallocate, []
 
     def full(file: int, start: int, size: int) -> None:
@@ -799,12 +799,12 @@ def test_a_disk_that_runs_full_leaves_nothing_behind(tmp_path, monkeypatch):
         reserve(file, start, size)
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(MerlError, match=r"^cannot keep a replay in .*: No space left on device$"):
+    with pytest.raises(MerlError, match=r"^cannot store a replay in .*: No space left on device$"):
         make(tmp_path / "run" / "replay")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_limit_of_the_system_leaves_nothing_behind(tmp_path):
+def test_file_size_limit_leaves_no_files(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
@@ -834,7 +834,7 @@ def test_growing_on_a_full_disk_changes_nothing(tmp_path, monkeypatch):
     check(run.replay, run.account)
 
 
-def test_what_a_dead_process_had_begun_to_reserve_is_replaced(tmp_path):
+def test_files_without_header_are_replaced(tmp_path):
     Run(tmp_path).play(5)
     (tmp_path / "replay.json").unlink()
     run = Run(tmp_path)
@@ -844,14 +844,14 @@ def test_what_a_dead_process_had_begun_to_reserve_is_replaced(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("where", "what"), [("available_memory", "of memory"), ("free_disk", "of disk")]
+    ("function", "message"), [("available_memory", "of memory"), ("free_disk", "of disk")]
 )
-def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, where, what):
+def test_error_names_the_largest_capacity_that_fits(tmp_path, monkeypatch, function, message):
     settings = ReplayConfig()
     room = 30_000_000
-    monkeypatch.setattr(f"merl.replay.config.{where}", lambda *_: room)
+    monkeypatch.setattr(f"merl.replay.config.{function}", lambda *_: room)
     directory = tmp_path / "run" / "replay"
-    with pytest.raises(MerlError, match=what) as caught:
+    with pytest.raises(MerlError, match=message) as caught:
         EpisodeRing(settings, OBSERVATIONS, ACTIONS, directory=directory)
     assert "1,000,000 steps" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -866,14 +866,14 @@ def test_what_does_not_fit_is_refused_with_what_would(tmp_path, monkeypatch, whe
 @pytest.mark.parametrize("count", [1, 3, 7])
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("capacity", [20, 100])
-def test_several_rings_take_what_was_announced(tmp_path, count, compress, capacity):
+def test_several_rings_take_the_computed_bytes(tmp_path, count, compress, capacity):
     settings = config(capacity=capacity, batch_size=20, compress=compress)
     ReplayBuffer(settings, OBSERVATIONS, ACTIONS, count=count, directory=tmp_path)
     taken = sum(file.stat().st_size for file in tmp_path.rglob("*.bin"))
     assert taken == replay_bytes(settings, OBSERVATIONS, ACTIONS, rings=count)
 
 
-def test_rings_that_do_not_fit_together_are_refused(tmp_path, monkeypatch):
+def test_rings_that_do_not_fit_together_are_rejected(tmp_path, monkeypatch):
     settings = config(capacity=100)
     both = replay_bytes(settings, OBSERVATIONS, ACTIONS, rings=2)
     monkeypatch.setattr("merl.replay.config.available_memory", lambda: both - 1)
@@ -884,7 +884,7 @@ def test_rings_that_do_not_fit_together_are_refused(tmp_path, monkeypatch):
     ReplayBuffer(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
 
 
-def test_where_compression_would_fit_that_is_said(monkeypatch):
+def test_error_suggests_compression_if_it_fits(monkeypatch):
     camera = gymnasium.spaces.Box(0, 255, (84, 84, 3), np.uint8)
     spaces = gymnasium.spaces.Dict({"camera": camera})
     monkeypatch.setattr("merl.replay.config.available_memory", lambda: 8_000_000_000)
@@ -900,7 +900,7 @@ def test_where_compression_would_fit_that_is_said(monkeypatch):
         check_fits(ReplayConfig(), spaces, ACTIONS)
 
 
-def test_memory_alone_counts_without_a_directory(monkeypatch):
+def test_disk_space_is_ignored_without_a_directory(monkeypatch):
     monkeypatch.setattr("merl.replay.config.free_disk", lambda *_: 0)
     make()
     monkeypatch.setattr("merl.replay.config.available_memory", lambda: 10)
@@ -908,7 +908,7 @@ def test_memory_alone_counts_without_a_directory(monkeypatch):
         make()
 
 
-def test_opened_again_on_a_disk_that_it_fills_itself(tmp_path, monkeypatch):
+def test_existing_replay_opens_on_a_disk_that_it_fills(tmp_path, monkeypatch):
     make(tmp_path)
     monkeypatch.setattr("merl.replay.config.free_disk", lambda *_: 0)
     make(tmp_path)
@@ -916,7 +916,7 @@ def test_opened_again_on_a_disk_that_it_fills_itself(tmp_path, monkeypatch):
         make(tmp_path, capacity=25)
 
 
-# What is refused
+# Rejected input
 
 
 @pytest.mark.parametrize(
@@ -930,13 +930,13 @@ def test_opened_again_on_a_disk_that_it_fills_itself(tmp_path, monkeypatch):
         ("discount", float("nan")),
     ],
 )
-def test_a_config_out_of_range_names_field_and_value(name, value):
+def test_error_names_field_and_value_out_of_range(name, value):
     flag = name.replace("_", "-")
     with pytest.raises(MerlError, match=rf"replay\.{flag} .* {value}"):
         ReplayConfig(**{name: value})
 
 
-def test_a_batch_larger_than_the_replay_is_refused():
+def test_batch_larger_than_the_replay_is_rejected():
     with pytest.raises(MerlError, match=r"batch-size 256 .* of 100 steps"):
         ReplayConfig(capacity=100)
 
@@ -951,7 +951,7 @@ def test_a_batch_larger_than_the_replay_is_refused():
         gymnasium.spaces.Box(0, 9, (0,), np.float32),
     ],
 )
-def test_a_space_that_is_neither_image_nor_vector_is_refused(space):
+def test_space_that_is_neither_image_nor_vector_is_rejected(space):
     with pytest.raises(MerlError, match="observation 'depth'"):
         EpisodeRing(config(), gymnasium.spaces.Dict({"depth": space}), ACTIONS)
 
@@ -968,7 +968,7 @@ def test_a_space_that_is_neither_image_nor_vector_is_refused(space):
         ("joints", None),
     ],
 )
-def test_an_observation_that_does_not_fit_its_space_is_refused_whole(key, value):
+def test_observation_that_does_not_fit_its_space_changes_nothing(key, value):
     replay, account = make(), Account(config())
     for t in range(6):
         write(replay, account, 0, t, Episode(50, "end"))
@@ -982,21 +982,21 @@ def test_an_observation_that_does_not_fit_its_space_is_refused_whole(key, value)
     check(replay, account)
 
 
-def test_vectors_of_another_float_type_are_taken():
+def test_vectors_of_another_float_type_are_accepted():
     replay = make()
     replay.begin(observe(0, 0) | {"joints": np.arange(5, dtype=np.float64)})
     replay.add(Transition(np.zeros(2, np.float64), 0, 1, observe(0, 1), last=False))
     assert replay.sample(1, Every()).observation["joints"].tolist() == [[0, 1, 2, 3, 4]]
 
 
-def test_an_action_of_another_shape_is_refused():
+def test_action_of_another_shape_is_rejected():
     replay = make()
     replay.begin(observe(0, 0))
     with pytest.raises(MerlError, match="action"):
         replay.add(Transition(np.zeros(3, np.float32), 0.0, 1.0, observe(0, 1), last=False))
 
 
-def test_calls_out_of_order_are_refused():
+def test_calls_out_of_order_are_rejected():
     replay = make()
     step = Transition(act(0, 0), 0.0, 1.0, observe(0, 1), last=True)
     with pytest.raises(ValueError, match="empty"):
@@ -1012,21 +1012,21 @@ def test_calls_out_of_order_are_refused():
 
 
 @pytest.mark.parametrize(("discount", "last"), [(0.0, False), (0.99, False), (0.99, True)])
-def test_a_discount_that_contradicts_the_contract_is_refused(discount, last):
+def test_invalid_discount_is_rejected(discount, last):
     replay = make()
     replay.begin(observe(0, 0))
     with pytest.raises(ValueError, match="discount"):
         replay.add(Transition(act(0, 0), 0.0, discount, observe(0, 1), last))
 
 
-def test_a_directory_with_another_replay_is_refused(tmp_path):
+def test_directory_with_another_replay_is_rejected(tmp_path):
     make(tmp_path)
     other = gymnasium.spaces.Dict({"joints": OBSERVATIONS["joints"]})
     with pytest.raises(MerlError, match="other observations"):
         EpisodeRing(config(), other, ACTIONS, directory=tmp_path)
 
 
-def test_a_damaged_directory_is_refused(tmp_path):
+def test_damaged_directory_is_rejected(tmp_path):
     make(tmp_path)
     os.truncate(tmp_path / "observation.front.bin", 100)
     with pytest.raises(MerlError, match="truncated"):
@@ -1039,8 +1039,8 @@ def test_a_damaged_directory_is_refused(tmp_path):
         make(tmp_path)
 
 
-def test_a_file_where_the_directory_should_be_is_refused(tmp_path):
+def test_file_in_place_of_the_directory_is_rejected(tmp_path):
     (tmp_path / "run").write_text("a file")
-    with pytest.raises(MerlError, match="cannot keep a replay in"):
+    with pytest.raises(MerlError, match="cannot store a replay in"):
         make(tmp_path / "run" / "replay")
     assert (tmp_path / "run").read_text() == "a file"

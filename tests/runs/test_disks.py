@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import os
 import re
 import signal
 import subprocess
@@ -47,6 +48,7 @@ def test_a_run_on_a_bad_disk(which: str, tmp_path: Path) -> None:
         text=True,
         check=False,
         timeout=900,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
     )
     assert done.returncode == 0, done.stdout + done.stderr
 

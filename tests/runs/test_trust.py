@@ -220,7 +220,7 @@ def test_a_module_is_loaded_from_its_folder_and_replaces_no_other(tmp_path: Path
     assert module.__file__ == str(tmp_path / "colorsys.py")
     assert module_folder("colorsys:make") == tmp_path
     assert sys.path[-1] == str(tmp_path)
-    with pytest.raises(MerlError, match=r"json\.py cannot be imported: 'json' is the name of ano"):
+    with pytest.raises(MerlError, match=r"json\.py cannot be imported, because another module is named 'json'"):
         load_module("json:make", tmp_path)
     assert sys.modules["json"] is json
 

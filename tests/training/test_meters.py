@@ -1,4 +1,4 @@
-"""When a run saves: never later than asked for, as long as an episode is shorter than that."""
+"""Means of metrics, and the schedule of saves."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from merl.training.meters import Averages, Interval
 
 
-def test_a_metric_that_not_every_update_has_is_averaged_over_those_that_have_it() -> None:
+def test_a_metric_is_averaged_over_the_updates_that_have_it() -> None:
     averages = Averages()
     averages.add({"critic_loss": torch.tensor(1.0)})
     averages.add({"critic_loss": torch.tensor(3.0), "actor_loss": torch.tensor(5.0)})
@@ -24,7 +24,7 @@ def test_a_metric_that_not_every_update_has_is_averaged_over_those_that_have_it(
     ("episode", "most"),
     [(7.0, 294.0), (120.0, 240.0), (299.0, 299.0), (300.0, 300.0), (400.0, 400.0)],
 )
-def test_saves_lie_as_far_apart_as_they_may(episode: float, most: float) -> None:
+def test_the_time_between_saves_is_as_long_as_allowed(episode: float, most: float) -> None:
     clock = [0.0]
     interval = Interval(300.0, lambda: clock[0])
     saves = [0.0]
@@ -32,26 +32,26 @@ def test_saves_lie_as_far_apart_as_they_may(episode: float, most: float) -> None
         clock[0] += episode
         if interval.is_due():
             saves.append(clock[0])
-            clock[0] += 0.5  # that a save takes
+            clock[0] += 0.5  # duration of a save
             interval.saved()
     apart = [after - before for before, after in pairwise(saves)]
     assert max(apart) == pytest.approx(most, abs=1.0)
     assert min(apart) >= most - 1.0
 
 
-def test_an_interval_of_nothing_is_always_over() -> None:
+def test_an_interval_of_zero_is_always_due() -> None:
     clock = [0.0]
     interval = Interval(0.0, lambda: clock[0])
     clock[0] += 1e-3
     assert interval.is_due()
 
 
-def test_an_episode_that_takes_much_longer_is_saved_within() -> None:
-    """And again at its end, from which a run resumes exactly."""
+def test_a_very_long_episode_has_a_save_within() -> None:
+    """Another save follows at its end, from which a run resumes exactly."""
     clock = [0.0]
     interval = Interval(300.0, lambda: clock[0])
     clock[0] = 400.0
-    assert not interval.is_overdue()  # an episode may take so long
+    assert not interval.is_overdue()  # an episode of this duration is allowed
     assert interval.is_due()
     interval.saved()
     clock[0] += 1799.0
@@ -67,7 +67,7 @@ def test_an_episode_that_takes_much_longer_is_saved_within() -> None:
     assert not interval.is_due()
 
 
-def test_where_no_episode_ends_saves_lie_twice_the_interval_apart() -> None:
+def test_without_ends_of_episodes_saves_are_two_intervals_apart() -> None:
     clock = [0.0]
     interval = Interval(300.0, lambda: clock[0])
     saves = []

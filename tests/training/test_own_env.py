@@ -334,7 +334,7 @@ def test_an_arm_that_has_become_another_is_refused(
     ("arguments", "says"),
     [
         (["CartPole-v1"], "actions are Discrete(2)"),
-        (["Pendulum-v1", "--agent", "drqv2"], "or take --agent merl_state, ddpg or sac"),
+        (["Pendulum-v1", "--agent", "drqv2"], "or use --agent merl_state, ddpg or sac"),
         (
             ["merl.envs.dot:whole", "--agent", "sac", "--agent.vectors", "state"],
             "agent.vectors names 'state', but the environment gives ['joints']",
@@ -364,7 +364,7 @@ def test_an_arm_that_has_become_another_is_refused(
         (["gymnasium:make"], "takes no arguments"),
         (["merl/MoveBox-v0"], "use its name, move_box"),
         (["merl:merl/MoveBox-v0"], "use its name, move_box"),
-        (["merl.envs.dot:whole", "--agent", "ddpg", "--agent.vectors", "x"], "have it give 'x'"),
+        (["merl.envs.dot:whole", "--agent", "ddpg", "--agent.vectors", "x"], "or add 'x' to the"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(

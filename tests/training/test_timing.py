@@ -25,9 +25,9 @@ CONFIG = TrainConfig(
 )
 
 
-def test_several_threads_must_pay() -> None:
+def test_bf16_and_several_threads_need_a_minimum_speedup() -> None:
     assert Timing({FP32: 2.0, BF16: 1.0}, 0.1).best == BF16
-    assert Timing({FP32: 2.0, BF16: 1.85}, 0.1).best == FP32  # alike: the same in every run
+    assert Timing({FP32: 2.0, BF16: 1.85}, 0.1).best == FP32  # about equally fast: fp32 in every run
     assert Timing({FP32: 2.0, BF16: 1.8}, 0.1).best == BF16
     assert Timing({FP32: 2.0, BF16: 1.0, BF16_ALL: 0.9}, 0.1).best == BF16
     assert Timing({FP32: 2.0, BF16: 1.0, BF16_ALL: 0.7}, 0.1).best == BF16_ALL
@@ -51,25 +51,25 @@ def test_the_time_of_a_run_counts_its_videos() -> None:
     assert seconds == {"each": pytest.approx(4 * 2.5), "last": pytest.approx(2.5), "none": 0}
 
 
-def test_a_frame_is_timed_where_videos_are_made() -> None:
+def test_a_frame_is_timed_only_if_videos_are_made() -> None:
     env, eval_env = DotEnv(), DotEnv()
     env.length = 10_000
     none = dataclasses.replace(CONFIG, eval=EvaluationConfig(video="none"))
-    for config, filmed in ((CONFIG, True), (none, False)):
+    for config, has_video in ((CONFIG, True), (none, False)):
         timing = measure(config, env, eval_env, env.observation_space, torch.device("cpu"))
-        assert (timing.frame > 0) == filmed
+        assert (timing.frame > 0) == has_video
 
 
 class Untouchable(DotEnv):
-    """A robot that must not move."""
+    """A robot that must not move: `reset`, `step` and `render` fail."""
 
     def reset(self, **_: Any) -> Any:
-        raise AssertionError("it was reset")
+        raise AssertionError("the environment was used")
 
     step = render = reset
 
 
-def test_environment_is_not_touched_unless_it_may_be_measured() -> None:
+def test_a_user_environment_is_not_used_without_measure() -> None:
     config = dataclasses.replace(CONFIG, measure=False)
     env = Untouchable()
     timing = measure(config, env, Untouchable(), env.observation_space, torch.device("cpu"))
@@ -81,7 +81,7 @@ def test_environment_is_not_touched_unless_it_may_be_measured() -> None:
     ("precision", "threads", "tried"),
     [("auto", 1, {FP32, BF16}), ("fp32", 1, {FP32}), ("bf16", 1, {BF16})],
 )
-def test_only_what_is_left_open_is_timed(precision, threads, tried) -> None:  # type: ignore[no-untyped-def]
+def test_only_open_choices_are_timed(precision: Any, threads: int, tried: set[Arithmetic]) -> None:
     agent = dataclasses.replace(CONFIG.agent, precision=precision)
     config = dataclasses.replace(CONFIG, agent=agent, threads=threads)
     env = DotEnv()
@@ -92,7 +92,7 @@ def test_only_what_is_left_open_is_timed(precision, threads, tried) -> None:  # 
     assert timing.step > 0
 
 
-def with_compile(torch_compile: str) -> TrainConfig:
+def with_compile(torch_compile: Any) -> TrainConfig:
     agent = dataclasses.replace(CONFIG.agent, precision="fp32", torch_compile=torch_compile)
     return dataclasses.replace(CONFIG, agent=agent, threads=1)
 
@@ -104,15 +104,17 @@ def with_compile(torch_compile: str) -> TrainConfig:
         ("auto", "cuda", 0.9 * WORTH_COMPILING, False),
         ("auto", "cpu", 1.1 * WORTH_COMPILING, False),
         ("no", "cuda", 1.1 * WORTH_COMPILING, False),
-        ("yes", "cuda", 1.1 * WORTH_COMPILING, False),  # that is what was timed already
+        ("yes", "cuda", 1.1 * WORTH_COMPILING, False),  # the timed update was already compiled
     ],
 )
-def test_compiling_is_tried_on_a_gpu_for_a_long_run(asked, device, seconds, tried) -> None:  # type: ignore[no-untyped-def]
+def test_compiling_is_tried_on_a_gpu_for_a_long_run(
+    asked: str, device: str, seconds: float, tried: bool
+) -> None:
     slow = Timing({FP32: 0.0}, seconds / (CONFIG.steps + 10 * 250))
     assert worth_compiling(with_compile(asked), slow, torch.device(device)) == tried
 
 
-def test_where_compiling_fails_it_is_left_out_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_compilation_is_skipped_and_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("no compiler\n  at all")
 
@@ -121,28 +123,28 @@ def test_where_compiling_fails_it_is_left_out_and_told(monkeypatch: pytest.Monke
     env = DotEnv()
     env.length = 10_000
     cpu = torch.device("cpu")
-    found = measure(with_compile("auto"), env, DotEnv(), env.observation_space, cpu)
-    assert set(found.update) == {FP32}
-    assert found.not_compiled == "no compiler"
-    assert found.best.decided(CONFIG.agent).torch_compile == "no"
+    result = measure(with_compile("auto"), env, DotEnv(), env.observation_space, cpu)
+    assert set(result.update) == {FP32}
+    assert result.not_compiled == "no compiler"
+    assert result.best.decided(CONFIG.agent).torch_compile == "no"
     with pytest.raises(MerlError, match=r"yes: the compiled update fails here \(no compiler\)"):
         measure(with_compile("yes"), env, DotEnv(), env.observation_space, cpu)
 
 
 @pytest.mark.long
-def test_where_compiling_works_it_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes a minute, and a C++ compiler."""
+def test_a_working_compilation_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This test takes a minute and needs a C++ compiler."""
     monkeypatch.setattr(timing, "worth_compiling", lambda *_: True)
     env = DotEnv()
     env.length = 10_000
-    found = measure(with_compile("auto"), env, DotEnv(), env.observation_space, torch.device("cpu"))
+    result = measure(with_compile("auto"), env, DotEnv(), env.observation_space, torch.device("cpu"))
     compiled = dataclasses.replace(FP32, compiled=True)
-    assert set(found.update) == {FP32, compiled}
-    assert found.not_compiled is None
+    assert set(result.update) == {FP32, compiled}
+    assert result.not_compiled is None
     assert compiled.decided(CONFIG.agent).torch_compile == "yes"
 
 
-def test_updates_with_and_without_the_actor_are_timed_in_their_proportion(
+def test_timing_averages_updates_with_and_without_the_actor(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock, made = [0.0], [0]

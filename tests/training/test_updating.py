@@ -33,14 +33,14 @@ def random_batch() -> Batch:
     return Batch(now, action, torch.rand(4, generator=rng), torch.full((4,), 0.9), then)
 
 
-def test_each_kind_of_update_is_warmed_up_and_recorded_by_itself(
+def test_each_kind_of_update_has_its_own_warm_up_and_recording(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With a recording that stands for a graph: while it is recorded, nothing is computed."""
+    """A fake graph replaces CUDA graphs; replaying it computes nothing."""
     agent, batch, events = make(actor_every=2), random_batch(), []
     recorded = Recorded(agent, lambda: batch)
 
-    class Graph:
+    class FakeGraph:
         def __init__(self, kind: bool) -> None:
             self.kind = kind
 
@@ -51,15 +51,15 @@ def test_each_kind_of_update_is_warmed_up_and_recorded_by_itself(
         kind = agent.actor_is_due
         events.append(("record", kind))
         recorded._values[kind] = recorded._learn()
-        return cast(torch.cuda.CUDAGraph, Graph(kind))
+        return cast(torch.cuda.CUDAGraph, FakeGraph(kind))
 
-    def learn_aside() -> Tensor:
+    def learn_on_stream() -> Tensor:
         events.append(("warm up", agent.actor_is_due))
         return recorded._learn()
 
     monkeypatch.setattr(recorded, "_on_gpu", True)
     monkeypatch.setattr(recorded, "_record", record)
-    monkeypatch.setattr(recorded, "_learn_aside", learn_aside)
+    monkeypatch.setattr(recorded, "_learn_on_stream", learn_on_stream)
     metrics = [recorded() for _ in range(10)]
     assert agent.updates == 10
     kinds = [False, True] * 5

@@ -1,1 +1,1 @@
-"""Acting and learning in turn, for any agent on any environment; measured, saved, evaluated."""
+"""Training of any agent on any environment: the loop, timing, evaluations, checkpoints."""

@@ -1,4 +1,4 @@
-"""Callbacks: code that is called while a run is trained."""
+"""Callbacks: objects whose methods are called at the events of training."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ if TYPE_CHECKING:
 
 
 class Callback:
-    """Called at the events of training; override the methods that you need.
+    """Base class of callbacks; override the methods for the events that you need.
 
     If a method raises an exception, the run is saved and ends with that exception.
     """
 
     def on_start(self, trainer: Trainer) -> None:
-        """Training starts or resumes; `trainer.setup.progress` says at which step."""
+        """Handle the start or the resume of training, at step `trainer.setup.progress.step`."""
 
     def on_step(self, result: StepResult) -> bool | None:
-        """The environments took a step. Return False to stop training."""
+        """Handle a step of the environments; return False to stop training."""
 
     def on_update(self, step: int, metrics: Mapping[str, Tensor]) -> None:
-        """The agent learned at this step; the metrics are scalars on its device."""
+        """Handle the updates at this step; the metrics are scalars on the agent's device."""
 
     def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
-        """An episode ended; the metrics are the row that `metrics.csv` gets."""
+        """Handle the end of an episode; the metrics are the new row of `metrics.csv`."""
 
     def on_evaluation_step(self, episode: int, total: int) -> None:
-        """An evaluation took a step in episode number `episode` (from 0) of `total`."""
+        """Handle a step of an evaluation, in episode number `episode` (from 0) of `total`."""
 
     def on_evaluation(self, step: int, evaluation: Evaluation) -> None:
-        """An evaluation ended."""
+        """Handle the result of an evaluation."""
 
     def on_checkpoint(self, step: int) -> None:
-        """A checkpoint was written."""
+        """Handle a checkpoint that was written."""
 
     def on_warning(self, message: str) -> None:
-        """Something happened that the user should know and that does not stop the run."""
+        """Handle a warning for the user; training continues."""
 
     def on_end(self, outcome: Outcome | None) -> None:
-        """Training ended; the outcome is None if an exception ended it."""
+        """Handle the end of training; the outcome is None if an exception ended it."""
 
 
 class CallbackList(Callback):
-    """Several callbacks as one, called in their order."""
+    """One callback that calls several callbacks in order."""
 
     def __init__(self, callbacks: Iterable[Callback] = ()) -> None:
         self._callbacks = list(callbacks)
@@ -60,7 +60,7 @@ class CallbackList(Callback):
             callback.on_start(trainer)
 
     def on_step(self, result: StepResult) -> bool | None:
-        """Return False if any callback does."""
+        """Call every callback; return False if any of them returned False."""
         answers = [callback.on_step(result) for callback in self._callbacks]
         return not any(answer is False for answer in answers)
 

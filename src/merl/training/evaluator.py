@@ -1,4 +1,4 @@
-"""The evaluations of a run: when they are due, and what happens if one fails."""
+"""The evaluations of a run: their schedule, their results, and the handling of failures."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from merl.training.meters import Clock
 from merl.training.setup import Setup
 
 ATTEMPTS = 3
-"""Attempts at an evaluation that is killed or crashes the process; then it is skipped."""
+"""Maximum number of attempts at an evaluation during which the process crashes or is killed; after
+that, it is skipped."""
 
 
-class _Interrupted(Exception):  # noqa: N818 (no error, a way out)
-    """A signal ends an evaluation early."""
+class _Interrupted(Exception):  # noqa: N818 (not an error)
+    """A signal arrived, and the evaluation ends early."""
 
 
 class Evaluations:
-    """Evaluates the agent of a run and records the results.
+    """The evaluations of a run's agent and their results.
 
     Args:
         setup: agent, environment and progress.
         run: the run's folder.
-        metrics: receives the numbers.
+        metrics: receives the results.
         callbacks: notified of evaluations and warnings.
-        interrupt: ends an evaluation at once.
+        interrupt: signals; the first one ends an evaluation immediately.
 
     Attributes:
         last: the last evaluation; None before the first.
@@ -51,28 +52,29 @@ class Evaluations:
         self._warned = set[str]()
 
     def are_due(self) -> bool:
-        """Return whether to evaluate before training continues (not after its last step)."""
+        """Return whether an evaluation is due; False after the last step of training."""
         progress, every = self._setup.progress, self._config.eval.every
         if not every or progress.step >= self._config.steps:
             return False
         return progress.step // every > progress.evaluated // every
 
     def run(self, save: Callable[[], bool], clock: Clock, *, last: bool = False) -> None:
-        """Save, then evaluate: whatever the evaluation does, no training is lost.
+        """Save a checkpoint, so that a failing evaluation loses no training, and evaluate.
 
         Args:
             save: writes a checkpoint; returns whether it is on the disk.
-            clock: gives the time of the run.
-            last: no more training follows.
+            clock: provides the training time of the run.
+            last: whether this is the evaluation at the end of training.
 
         Raises:
-            EvaluationFailed: it raised an exception. The resumed run repeats it, and from then on
-                skips evaluations that fail, with a warning.
+            EvaluationFailed: the evaluation raised an exception. The resumed run repeats it; if it
+                fails again, the run skips it with a warning, and later evaluations that fail, too,
+                until one succeeds.
         """
-        progress, before = self._setup.progress, self.last
+        progress, previous = self._setup.progress, self.last
         progress.attempts += 1
         if progress.attempts > ATTEMPTS:
-            self._skip(f"was begun {ATTEMPTS} times and never finished")
+            self._skip(f"was started {ATTEMPTS} times and never finished")
             return
         save()
         try:
@@ -89,11 +91,11 @@ class Evaluations:
         values = {f"eval/{name}": value for name, value in self.last.metrics().items()}
         self._metrics.write(progress.step, values | {"time/seconds": clock.seconds()})
         self._callbacks.on_evaluation(progress.step, self.last)
-        if before is not None and not self.last.starts_as(before):
+        if previous is not None and not self.last.starts_as(previous):
             self._warn_once(
-                "the episodes of this evaluation do not start as those of the one before, with the "
-                "same seeds: the environment or a wrapper of it keeps state across resets, or does "
-                "not follow its seed"
+                "the episodes of this evaluation start differently from those of the previous one, "
+                "although the seeds are the same: the environment or one of its wrappers keeps "
+                "state across resets, or ignores the seed"
             )
 
     def _evaluate(self, last: bool) -> Evaluation:
@@ -102,8 +104,8 @@ class Evaluations:
         step = setup.progress.step
         assert setup.eval_env is not None
         policy = Policy(setup.agent, self._config, setup.space, setup.device, step)
-        wanted = config.video == "each" or (config.video == "last" and last)
-        record = setup.records_video and wanted
+        is_due = config.video == "each" or (config.video == "last" and last)
+        record = setup.records_video and is_due
         return evaluate(
             policy,
             setup.eval_env,
@@ -119,8 +121,8 @@ class Evaluations:
     def _fail(self, error: Exception, save: Callable[[], bool]) -> None:
         """Handle an evaluation's exception: end the run, or skip the evaluation.
 
-        It is skipped if it was begun before, or if the evaluation before it was skipped: so a
-        resumed run does not end by the same failure again.
+        Skip it if it was started before, or if the previous evaluation was skipped, so that a
+        resumed run does not end with the same failure again.
         """
         self._run.check_there()
         why = str(error) if isinstance(error, MerlError) else in_one_line(error)
@@ -128,7 +130,7 @@ class Evaluations:
             self._skip(f"failed again: {why}")
             return
         line = resume_line(self._run.path)
-        saved = f"the run is saved at that step: mend it, and resume with `{line}`"
+        saved = f"the run is saved at that step: fix the cause, and resume with `{line}`"
         if not save():
             saved = f"resume from the last checkpoint with `{line}`"
         step = self._setup.progress.step
@@ -146,13 +148,13 @@ class Evaluations:
         )
 
     def _warn_once(self, message: str) -> None:
-        """Warn, but only once with the same message: each evaluation would repeat it."""
+        """Warn, but only once with the same message, which every evaluation would repeat."""
         if message not in self._warned:
             self._warned.add(message)
             self._callbacks.on_warning(message)
 
     def _on_step(self, episode: int) -> None:
-        """Notify the callbacks of a step of an evaluation; end it at once if the run is to stop."""
+        """Notify the callbacks of a step of an evaluation; end it if a signal has arrived."""
         if self._interrupt.number is not None:
             raise _Interrupted
         self._callbacks.on_evaluation_step(episode, self._config.eval.episodes)

@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from merl.training.trainer import Outcome, Trainer
 
 RECENT = 10
-"""Training episodes over which the shown means are taken."""
+"""Number of training episodes in the shown means."""
 PLAIN_INTERVAL = 30.0
-"""Seconds between two lines where there is no terminal."""
+"""Seconds between two progress lines if the output is not a terminal."""
 SPARKS = "▁▂▃▄▅▆▇█"
 ASCII_SPARKS = "_.-=+*%#"
 SPARK_WIDTH = 40
-"""Characters of a sparkline; more values than that are averaged."""
+"""Maximum length of a sparkline in characters; neighbours are averaged if there are more values."""
 
 
 class LiveView(Callback):
-    """Shows a run as a live table on a terminal, and as plain lines elsewhere.
+    """View of a run: a live table on a terminal, plain lines in other output.
 
     Args:
         console: where to print.
-        scale: {name: return} of references, from the lowest to the highest, e.g. random actions and
-            an expert; empty if unknown.
+        scale: {name: return} of references, e.g. random actions and an expert, from the lowest to
+            the highest return; empty if unknown.
     """
 
     def __init__(self, console: Console, scale: Mapping[str, float] | None = None) -> None:
@@ -51,19 +51,19 @@ class LiveView(Callback):
         self._is_live = console.is_interactive
         self._speed = self._training = self._learner = self._evaluation = self._note = ""
         self._recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
-        self._returns: list[float] = []  # of all evaluations
+        self._returns: list[float] = []  # mean returns of all evaluations
         self._training_return: float | None = None  # of the last episode
         self._step = self._updates = self._total = self._learning_starts = 0
         self._minutes: float | None = None
         self._start = self._printed = time.perf_counter()
         self._learning_since: tuple[float, int] | None = None  # time and step of the first update
-        # Rich draws in another thread: replace values, never change them in place.
+        # Rich draws in another thread: replace objects, do not change them in place.
         self._live = Live(
             console=console, refresh_per_second=4, transient=False, get_renderable=self._draw
         )
 
     def on_end(self, outcome: Outcome | None) -> None:
-        """Leave the last drawing on the terminal."""
+        """Draw the table for the last time and leave it on the terminal."""
         if self._live.is_started:
             self._live.refresh()
             self._live.stop()
@@ -76,15 +76,15 @@ class LiveView(Callback):
         self._learning_starts = config.seed_steps
         self._returns = _earlier_returns(run)
         every = config.eval.every
-        self._evaluation = f"the first one after step {every:,}, or at the end" if every else ""
+        self._evaluation = f"first one after step {every:,}, or at the end" if every else ""
         self._start = self._printed = time.perf_counter()
         if self._is_live:
             self._live.start()
         elif self._scale:
-            self._print(f"returns to compare with: {self._compared()}")
+            self._print(f"returns to compare with: {self._references()}")
 
     def on_step(self, result: StepResult) -> bool | None:
-        """Show an environment step."""
+        """Show a step of the environments."""
         self._step, self._updates = result.step, result.updates
         if self._learning_since is None and result.updates:
             self._learning_since = time.perf_counter(), result.step
@@ -121,7 +121,7 @@ class LiveView(Callback):
         self._returns = [*self._returns, evaluation.returns.mean]
         self._evaluation = f"at step {step:,}: {describe(evaluation)}"
         if not self._is_live:
-            self._print(f"evaluation {self._evaluation}{self._excuse()}")
+            self._print(f"evaluation {self._evaluation}{self._low_return_note()}")
             if len(self._returns) > 1:
                 self._print(f"returns of all evaluations: {self._sparkline()}")
 
@@ -151,7 +151,7 @@ class LiveView(Callback):
             "learner": self._learner,
             "evaluation": self._evaluation,
             "evaluations": self._sparkline() if len(self._returns) > 1 else "",
-            "compare with": self._compared(),
+            "compare with": self._references(),
         }
         table = Table.grid(padding=(0, 2))
         for name, text in rows.items():
@@ -160,7 +160,7 @@ class LiveView(Callback):
         return Group(bar, table, Text(self._note, style="dim"))
 
     def _position(self) -> str:
-        """Return the steps so far, and the minutes if they are limited."""
+        """Return the steps so far and their limit, and the time if it is limited."""
         steps = f"step {self._step:,} of {self._total:,}"
         if self._minutes is None:
             return steps
@@ -169,7 +169,7 @@ class LiveView(Callback):
         return f"{_clock(passed)} of {_clock(limit)}, or {steps}"
 
     def _fraction(self) -> float:
-        """Return the fraction done, by the limit that is reached first: steps or minutes."""
+        """Return the completed fraction of the limit that is reached first, steps or minutes."""
         fraction = self._step / max(self._total, 1)
         if self._minutes is not None:
             passed = time.perf_counter() - self._start
@@ -177,9 +177,9 @@ class LiveView(Callback):
         return min(fraction, 1.0)
 
     def _time_left(self) -> str:
-        """Estimate the time to the limit that is reached first; empty while unknown.
+        """Estimate the time to the limit that is reached first; return "" while it is unknown.
 
-        Steps before the first update are much faster: use only the pace after it.
+        Use only the speed since the first update, since steps before it are much faster.
         """
         now, estimates = time.perf_counter(), []
         if self._minutes is not None:
@@ -192,10 +192,10 @@ class LiveView(Callback):
         return f"{_clock(left)} left" if left > 0 else ""
 
     def _recent_training(self) -> str:
-        """Format return and success of the last training episodes, with exploration noise."""
+        """Format return and success of the last training episodes, which have noise."""
         values = f"return {mean(row['train/return'] for row in self._recent):.1f}"
         name = "train/success_end"
-        if any(name in row for row in self._recent):  # a row without it failed
+        if any(name in row for row in self._recent):  # a row without this metric is a failure
             values += f", success {mean(row.get(name, 0.0) for row in self._recent):.0%}"
         count = len(self._recent)
         about = f"the last {count} episodes, with noise" if count > 1 else "one episode, with noise"
@@ -203,22 +203,22 @@ class LiveView(Callback):
             about += f"; learning begins at step {self._learning_starts:,}"
         return f"{values} ({about})"
 
-    def _compared(self) -> str:
-        """Format the returns to compare with, and why the agent may be below all of them."""
+    def _references(self) -> str:
+        """Format the returns of the references, and a note if the agent is below all of them."""
         names = ", ".join(f"{name} {value:.1f}" for name, value in self._scale.items())
-        return f"{names}{self._excuse()}"
+        return f"{names}{self._low_return_note()}"
 
-    def _excuse(self) -> str:
-        """Explain why the newest return may be below all references; empty if it is not."""
+    def _low_return_note(self) -> str:
+        """Explain why the newest return is below all references; return "" if it is not."""
         newest = self._returns[-1] if self._returns else self._training_return
         if newest is None or not self._scale or newest >= min(self._scale.values()):
             return ""
         return f"; at first an agent is often below {min(self._scale, key=self._scale.__getitem__)}"
 
     def _sparkline(self) -> str:
-        """Draw the returns of all evaluations on a scale from the lowest to the highest value."""
-        known = [*self._returns, *self._scale.values()]
-        low, high = min(known), max(known)
+        """Draw the returns of all evaluations; the scale includes the references."""
+        values = [*self._returns, *self._scale.values()]
+        low, high = min(values), max(values)
         encoding = (self.console.encoding or "").lower()
         line = sparkline(self._returns, low, high, SPARKS if "utf" in encoding else ASCII_SPARKS)
         return f"{line} (scale: {low:.1f} to {high:.1f})"
@@ -228,19 +228,19 @@ def sparkline(values: Sequence[float], low: float, high: float, levels: str = SP
     """Draw values as one line of characters.
 
     Args:
-        values: at least one; more than `SPARK_WIDTH` are averaged in groups of neighbours.
-        low: the value of the lowest character.
-        high: the value of the highest character.
+        values: at least one value; if more than `SPARK_WIDTH`, groups of neighbours are averaged.
+        low: value of the lowest character.
+        high: value of the highest character.
         levels: the characters, from the lowest to the highest.
     """
     groups = np.array_split(np.asarray(values), min(len(values), SPARK_WIDTH))
     means = np.array([group.mean() for group in groups])
-    share = (means - low) / max(high - low, 1e-9)
-    return "".join(levels[index] for index in np.rint(share * (len(levels) - 1)).astype(int))
+    height = (means - low) / max(high - low, 1e-9)
+    return "".join(levels[index] for index in np.rint(height * (len(levels) - 1)).astype(int))
 
 
 def _earlier_returns(run: Run) -> list[float]:
-    """Return the mean returns of a resumed run's evaluations so far."""
+    """Return the mean returns of the evaluations so far, if the run is resumed."""
     try:
         with (run.path / METRICS_FILE).open(newline="", encoding="utf-8") as file:
             return [
@@ -257,7 +257,7 @@ def _clock(seconds: float) -> str:
 
 
 def describe(evaluation: Evaluation) -> str:
-    """Describe an evaluation in one line, with its intervals."""
+    """Describe an evaluation in one line, with confidence intervals."""
     returns, end = evaluation.returns, evaluation.success_end
     line = f"return {returns.mean:.1f} [{returns.low:.1f}, {returns.high:.1f}]"
     if end is not None and evaluation.success_any and evaluation.success_share:

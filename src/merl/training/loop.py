@@ -1,7 +1,7 @@
 """The loop of Algorithm 1: act, store the transition, learn.
 
-The loop is a generator that yields after every environment step: logging, evaluation and
-checkpoints stay outside of it, and the same loop serves every agent and every environment.
+The loop is a generator that yields after every environment step. Logging, evaluations and
+checkpoints are outside of the loop, so the same loop trains every agent in every environment.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from merl.replay import ReplayBuffer
 
 @dataclass
 class Progress:
-    """Counts that a run has reached."""
+    """Counts of a run so far."""
 
     step: int = 0
     updates: int = 0
     episodes: int = 0
     evaluated: int = 0  # the step of the last evaluation
-    attempts: int = 0  # at the evaluation that is due, all of which failed or were killed
-    restarts: int = 0  # of worker processes
-    reports_success: bool = False  # an episode of the environment has reported success or failure
+    attempts: int = 0  # at the due evaluation; all of them failed or were killed
+    restarts: int = 0  # of the worker processes
+    reports_success: bool = False  # an episode has reported success or failure
 
 
 @dataclass(frozen=True)
 class StepResult:
     """Result of one step of every environment.
 
-    If a resumed run still owes updates, the first result reports only those.
+    If updates are still due when a run resumes, the first result reports only these.
 
     Attributes:
         step: environment steps so far.
         updates: updates so far.
         learning: metrics of the updates at this step, scalars on the device; empty without one.
         episodes: the episodes that ended at this step.
-        lost: why a worker process died; the episodes in progress are cut off. None: none died.
+        lost: why a worker process died, which cuts off the episodes in progress; None if none died.
     """
 
     step: int
@@ -60,14 +60,14 @@ class StepResult:
 
 
 Update = Callable[[], dict[str, Tensor]]
-"""Make one update and return its metrics, scalars on the device."""
+"""A function that makes one update and returns its metrics, scalars on the device."""
 
 
 class Randomness:
-    """Random streams from one seed, split by purpose: drawing from one does not affect another.
+    """Random streams from one seed, one for each purpose; drawing from one does not affect another.
 
     Attributes:
-        agent: the seed of initialisation, noise and shifts.
+        agent: seed of initialisation, noise and shifts.
         actions: generator of the uniformly random actions at the start.
         batches: generator of the batches from replay.
     """
@@ -82,15 +82,15 @@ class Randomness:
         """Return the seed of an environment's first reset, in [0, 2^31).
 
         Args:
-            index: of the environment.
-            restart: how often the environments were restarted.
+            index: index of the environment.
+            restart: number of restarts of the environments so far.
         """
         if index == restart == 0:
             seed = self._environment
         else:
             words = np.random.SeedSequence((self._seed, index, restart)).generate_state(1)
             seed = int(words[0])
-        return seed % 2**31  # many simulators take the seed as a signed 32-bit integer
+        return seed % 2**31  # many simulators need a signed 32-bit integer
 
     def on_device(self, updates: int) -> int:
         """Return the seed for sampling from a replay on a GPU, starting after `updates` updates."""
@@ -118,19 +118,19 @@ def train(
     config: TrainConfig,
     is_to_stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[StepResult]:
-    """Act and learn until `config.steps`; yield after each step of the environments.
+    """Act and learn up to step `config.steps`; yield after each step of the environments.
 
     Args:
-        collector: acts and fills the replay. The loop seeds its environments if the run is new; the
-            caller has restored them if it is resumed.
+        collector: steps the environments and fills the replay. The loop seeds the environments of a
+            new run; the caller restores those of a resumed run before the call.
         agent: chooses actions.
-        update: lets the agent learn from the replay.
-        progress: counts, which the loop advances.
+        update: makes one update of the agent from the replay.
+        progress: counts of the run; updated by the loop.
         randomness: the run's random streams.
-        config: steps, seed steps, random steps, updates per step, batch size.
-        is_to_stop: return whether to leave the updates that are due to the resumed run. Ignored if
-            environments run beside the learner: the resumed run would make those updates from a
-            fuller replay.
+        config: steps, seed steps, random steps, updates per step.
+        is_to_stop: returns whether to stop before the next update, and to leave the remaining
+            updates to the resumed run. Ignored without `config.synchronous`, where the resumed run
+            would make these updates from a fuller replay.
 
     Raises:
         NotFinite: an observation or a reward is NaN or infinite; it does not enter the replay.
@@ -139,19 +139,19 @@ def train(
         collector.seed(randomness, progress)
     stopping = is_to_stop if config.synchronous else lambda: False
     learn = partial(_learn, update, progress, config, stopping)
-    # First the updates that were due when the run was stopped.
+    # First make the updates that were due when the run was stopped.
     agent.step = max(0, progress.step - config.action_repeat * collector.count)
-    left = learn() if config.synchronous else {}
-    if left or stopping():
-        yield StepResult(progress.step, progress.updates, left)
+    remaining = learn() if config.synchronous else {}
+    if remaining or stopping():
+        yield StepResult(progress.step, progress.updates, remaining)
     while progress.step < config.steps:
         agent.step = progress.step
         learning: dict[str, Tensor] = {}
         try:
             collector.begin_episodes(randomness, progress)
             actions = _actions(collector, agent, progress, randomness, config)
-            # Without `synchronous` the learner learns while the environments step. On a GPU launch
-            # the updates before waiting for the actions, so that it never idles.
+            # Without `synchronous` the updates run while the environments step. Launch them on a
+            # GPU before waiting for the actions, so that the GPU never idles.
             launched = actions.under_way and not config.synchronous
             if launched:
                 learning = learn()
@@ -170,15 +170,15 @@ def train(
 
 
 class Collector:
-    """Steps the environments and stores the transitions.
+    """Collector of transitions: it steps the environments and fills the replay.
 
     Args:
-        environments: one or several.
-        replay: has a ring for each environment.
-        stacks: the frame stack of each environment.
+        environments: one or several environments.
+        replay: the replay, with a ring for each environment.
+        stacks: a frame stack for each environment.
 
     Attributes:
-        broken: a worker process died; restart all before the next episode.
+        broken: whether a worker process died; then all restart before the next episode.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class Collector:
         self.environments, self.replay, self.stacks = environments, replay, stacks
         self.broken = False
         self._seeds: dict[int, int] = {}
-        self._episodes: dict[int, Episode] = {}  # those in progress
+        self._episodes: dict[int, Episode] = {}  # in progress, by environment
         self._actions: NDArray[np.float32] | None = None
 
     @property
@@ -205,7 +205,7 @@ class Collector:
         """Start an episode in every environment that has none in progress."""
         if self.broken:
             progress.restarts += 1
-            self._episodes.clear()  # the replay cuts them off where the next ones begin
+            self._episodes.clear()  # the replay cuts these off when the next ones begin
             self.environments.restart()
             self.seed(randomness, progress)
             self.broken = False
@@ -247,7 +247,7 @@ class Collector:
         return tuple(ended)
 
     def _where(self, index: int) -> str:
-        """Name the environment in an error message, if there are several."""
+        """Return words for an error message that name the environment, if there are several."""
         return f"of environment {index}" if self.count > 1 else ""
 
 
@@ -258,7 +258,7 @@ def _actions(
     randomness: Randomness,
     config: TrainConfig,
 ) -> Fetched:
-    """Choose actions, (count, A) in [-1, 1]: uniformly random at first, then the agent's."""
+    """Return actions (count, A) in [-1, 1]: uniformly random at first, later from the agent."""
     if progress.step < config.random_steps:
         shape = (collector.count, *collector.environments.action_shape)
         drawn = randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
@@ -267,14 +267,14 @@ def _actions(
 
 
 def updates_due(steps: int, updates_per_step: float) -> int:
-    """Return how many updates are due after these steps, exact in decimals (0.57 is 57/100)."""
+    """Return the number of updates due after `steps` steps; 0.57 counts as exactly 57/100."""
     return int(steps * Fraction(str(updates_per_step)))
 
 
 def _learn(
     update: Update, progress: Progress, config: TrainConfig, is_to_stop: Callable[[], bool]
 ) -> dict[str, Tensor]:
-    """Make the updates that are due: after t steps, (t - seed_steps) * updates_per_step in all."""
+    """Make the updates that are due: after step t, (t - seed_steps) * updates_per_step in total."""
     due = updates_due(progress.step - config.seed_steps, config.updates_per_step)
     metrics: dict[str, Tensor] = {}
     while progress.updates < due and not is_to_stop():

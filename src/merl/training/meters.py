@@ -1,4 +1,4 @@
-"""Meters of a run: time, rates, means of the learner's metrics, and when to save."""
+"""Meters of a run: time, rates, means of the learner's metrics, and the schedule of saves."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from merl.training.loop import Progress
 
 
 class Averages:
-    """Means of the learner's metrics since the last `take`; on the device until then."""
+    """Means of the learner's metrics since the last `take`; the sums stay on the device."""
 
     def __init__(self) -> None:
         self._sums: dict[str, Tensor] = {}
         self._counts: Counter[str] = Counter()
 
     def add(self, metrics: dict[str, Tensor]) -> None:
-        """Add the metrics of one update; not every update has all of them."""
+        """Add the metrics of one update, which may be only some of all metrics."""
         for name, value in metrics.items():
             self._sums[name] = self._sums[name] + value if name in self._sums else value
         self._counts.update(metrics.keys())
 
     def take(self) -> dict[str, float]:
-        """Return the means, and start again."""
+        """Return the means on the host, and reset them."""
         means = {f"learn/{name}": float(s) / self._counts[name] for name, s in self._sums.items()}
         self._sums, self._counts = {}, Counter()
         return means
 
 
 class Clock:
-    """Time of training across interruptions, and rates since the last mark.
+    """Training time of a run, without interruptions, and rates since the last mark.
 
-    It counts wall-clock time and the processor time of all threads: on a shared machine only the
-    latter can be compared.
+    The clock counts wall-clock time and the processor time of all threads. On a shared machine,
+    only processor times are comparable.
     """
 
     def __init__(self) -> None:
@@ -43,31 +43,31 @@ class Clock:
         self._mark = (0.0, 0, 0)
 
     def restore(self, seconds: float, cpu_seconds: float) -> None:
-        """Continue from the wall-clock and processor time of a checkpoint, in seconds."""
+        """Restore wall-clock and processor time from a checkpoint, in seconds."""
         self._before, self._cpu_before = seconds, cpu_seconds
         self._start, self._cpu_start = time.perf_counter(), time.process_time()
 
     def seconds(self) -> float:
-        """Return the wall-clock time of training since the run began, without interruptions."""
+        """Return the wall-clock time of training in seconds, without interruptions."""
         return self._before + self.stretch()
 
     def cpu_seconds(self) -> float:
-        """Return the processor time of training since the run began."""
+        """Return the processor time of training in seconds, of all threads."""
         return self._cpu_before + time.process_time() - self._cpu_start
 
     def stretch(self) -> float:
-        """Return the seconds since start or resume."""
+        """Return the wall-clock seconds since start or resume."""
         return time.perf_counter() - self._start
 
     def mark(self, progress: Progress) -> None:
-        """Measure the next rates from here."""
+        """Start to measure the next rates."""
         self._mark = (self.stretch(), progress.step, progress.updates)
 
     def rates(self, progress: Progress) -> dict[str, float]:
         """Return the time, and steps and updates per second since the last mark; set a mark."""
-        then, steps, updates = self._mark
+        start, steps, updates = self._mark
         self.mark(progress)
-        span = max(self.stretch() - then, 1e-9)
+        span = max(self.stretch() - start, 1e-9)
         return {
             "time/seconds": self.seconds(),
             "time/cpu_seconds": self.cpu_seconds(),
@@ -77,41 +77,41 @@ class Clock:
 
 
 class Interval:
-    """When to save: at the end of an episode, or within one that takes much longer than usual.
+    """Schedule of saves: at the end of an episode, or within one that takes much longer than usual.
 
     Args:
-        seconds: allowed between two saves.
-        now: returns the time, in seconds.
+        seconds: maximum time between two saves.
+        now: returns the time in seconds.
     """
 
     LEAST = 5.0
-    """Seconds: a shorter interval does not cause more saves within episodes."""
+    """Shortest interval, in seconds, that counts for saves within an episode."""
 
     def __init__(self, seconds: float, now: Callable[[], float] = time.perf_counter) -> None:
         self._seconds, self._now = seconds, now
-        self._saved = self._chance = now()
-        self._longest = 0.0  # between two chances
+        self._saved = self._episode_end = now()
+        self._longest = 0.0  # time between two ends of episodes
         self._within = False  # the last save was within an episode
 
     def is_due(self) -> bool:
-        """Return, at the end of an episode, whether waiting for the next end would be too late."""
+        """Return, at the end of an episode, whether a save at the next end would be too late."""
         now = self._now()
-        apart, self._chance = now - self._chance, now
+        apart, self._episode_end = now - self._episode_end, now
         self._longest = max(self._longest, apart)
-        # A run resumes exactly only from an episode's end: replace a save within one soon.
+        # A run resumes exactly only from the end of an episode: soon replace a save within one.
         return self._within or now + apart - self._saved > self._seconds
 
     def is_overdue(self) -> bool:
-        """Return, within an episode, whether waiting for its end would be too late."""
-        patience = 2 * max(self._seconds, self.LEAST) + 3 * self._longest
-        return self._now() - self._saved > patience
+        """Return, within an episode, whether a save at its end would be too late."""
+        limit = 2 * max(self._seconds, self.LEAST) + 3 * self._longest
+        return self._now() - self._saved > limit
 
     def saved(self, within: bool = False) -> None:
-        """Restart the count after a save, or after an attempt.
+        """Restart the interval after a save, or after an attempt to save.
 
         Args:
-            within: the save was within an episode.
+            within: whether the save was within an episode.
         """
         self._saved, self._within = self._now(), within
         if not within:
-            self._chance = self._saved
+            self._episode_end = self._saved

@@ -1,4 +1,4 @@
-"""Write the checkpoints of a run, and restore it from one."""
+"""Write the checkpoints of a run, and restore the run from a checkpoint."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from merl.training.setup import Setup
 
 
 class Saver:
-    """Writes checkpoints that a run resumes from exactly.
+    """Writer of a run's checkpoints, from which it also restores the run.
 
     Args:
         setup: agent, progress and random streams.
         run: the run's folder.
-        replay: saved beside the checkpoints.
-        environments: their random states are saved.
-        evaluations: the last one gives a checkpoint its score.
-        clock: time of the run so far.
-        guard: rejects weights and losses that are not finite.
+        replay: replay buffer, saved next to the checkpoints.
+        environments: the states of their random generators are saved.
+        evaluations: the last evaluation provides the score of a checkpoint.
+        clock: training time of the run so far.
+        guard: rejects losses that are not finite.
         callbacks: notified of checkpoints and warnings.
     """
 
@@ -55,15 +55,15 @@ class Saver:
         self.interval = Interval(setup.config.save_every)
 
     def save(self, *, within_episode: bool = False) -> bool:
-        """Write a checkpoint, unless the last one is of the present state.
+        """Write a checkpoint, unless the last one already has the current state.
 
         If it cannot be written, warn and continue.
 
         Args:
-            within_episode: an episode that takes long is still in progress.
+            within_episode: whether an episode is still in progress, because it takes long.
 
         Returns:
-            Whether a checkpoint of the present state is on the disk.
+            Whether a checkpoint of the current state is on the disk.
 
         Raises:
             MerlError: the run's folder is gone, or a weight or loss is not finite.
@@ -131,7 +131,7 @@ class Saver:
                 self._clock.restore(float(state["seconds"]), float(state["cpu_seconds"]))
         except WorkerDied as died:
             raise EnvironmentsLost(
-                f"an environment's process {died} right after its start: see what it said above"
+                f"an environment's process {died} right after its start: see its output above"
             ) from None
 
     def resumes_exactly(self) -> bool:

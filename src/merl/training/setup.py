@@ -1,4 +1,4 @@
-"""What a run needs before its first step: environments, agent, timing of this machine."""
+"""Preparation of a run before its first step: environments, agent, timing of this machine."""
 
 from __future__ import annotations
 
@@ -36,16 +36,17 @@ class Setup:
     """Environments, agent, progress and random streams of a run.
 
     Attributes:
-        config: with `device`, `threads`, the agent's `precision` and `torch_compile` decided.
-        left_open: names of the fields that this machine has decided.
+        config: the run's config, with fixed values of `device`, `threads`, and the agent's
+            `precision`, `torch_compile` and `critic_high`.
+        left_open: names of the fields that the given config left open.
         timing: time of a step and of an update on this machine.
         env: the environment for training.
         eval_env: the environment for evaluation; None without evaluations (`eval.every` is 0).
-        home: the working folder at the start, which contains a relative run folder.
+        home: the working folder at the start; a relative run folder is relative to it.
         records_video: whether `eval_env` renders images.
         space: the observation space, with the keys that the agent uses.
         action_space: the action space.
-        device: where the networks live.
+        device: device of the networks.
         agent: the learner.
         progress: counts of steps, updates and episodes.
         randomness: the random streams of the run.
@@ -62,10 +63,10 @@ class Setup:
         self.records_video = eval_env is not None and eval_env.render_mode == "rgb_array"
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
-        bounded(config.agent, config.replay.discount)  # rejects bad values before timing
+        bounded(config.agent, config.replay.discount)  # reject bad values before timing
         check_memory(config, self.space, self.action_space)
         keep_freed_memory()
-        # Without evaluations there are no videos whose frames could be timed.
+        # Without evaluations there are no videos: do not time their frames.
         timed = config
         if eval_env is None:
             timed = dataclasses.replace(config, eval=dataclasses.replace(config.eval, video="none"))
@@ -93,25 +94,25 @@ class Setup:
     @classmethod
     @contextmanager
     def prepare(cls, config: TrainConfig, *, new: bool) -> Iterator[Setup]:
-        """Build what a run needs. Reject here what cannot work; write nothing.
+        """Make environments and agent of a run, and check its config; write no files.
 
         Args:
-            config: of the run.
-            new: a new run: its folder must not exist and its replay must fit; the module of a
-                user's environment may lie in the working folder.
+            config: the config of the run.
+            new: whether the run is new: its folder must not exist, its replay must fit, and the
+                module of a user's environment may be in the working folder.
 
         Raises:
-            MerlError: a device, renderer, observation, folder or size is not available.
+            MerlError: a device, a renderer, an observation or a folder is not available, or a size
+                does not fit.
         """
         choose_device(config.device)
         processors = os.cpu_count() or 1
         if config.threads is not None and config.threads > processors:
             raise MerlError(
                 f"threads is {config.threads}, but this machine has "
-                f"{counted(processors, 'processor')}: "
-                f"give at most {processors}"
+                f"{counted(processors, 'processor')}: use at most {processors}"
             )
-        home = Path.cwd()  # before any user code runs, which may change it
+        home = Path.cwd()  # before user code runs, which may change the working folder
         if new:
             refuse_existing(run_path(config, home))
             if config.own_env and ":" in config.task:
@@ -132,31 +133,32 @@ class Setup:
             eval_env = None
             if config.eval.every:
                 size = max(config.env.render_size, MIN_SIDE)
-                # Whether a user's environment renders takes a reset to find out.
+                # Without videos, avoid the reset that tests whether a user's environment renders.
                 mode = None if config.own_env and config.eval.video == "none" else "rgb_array"
                 eval_env = make_run_env(config.evaluated, render_mode=mode, render_size=size)
                 stack.callback(eval_env.close)
                 expected = EnvSpaces.of(config, env)
-                expected.check(EnvSpaces.of(config, eval_env), "the one that is evaluated in")
+                expected.check(EnvSpaces.of(config, eval_env), "the one for evaluations")
                 if config.own_env:
                     check_instances(env, eval_env)
             yield cls(config, env, eval_env, home)
 
 
 def bounded(agent: AgentConfig, discount: float) -> AgentConfig:
-    """Return a config with the highest return of a categorical critic set.
+    """Return the config with a value of `critic_high`, if its critic predicts a histogram.
 
     Raises:
-        MerlError: the discount gives no bound, or one that is not above the lowest return.
+        MerlError: the discount gives no bound of the returns, or one that is not above
+            `critic_low`.
     """
     if agent.critic_loss == "mse" or agent.critic_high is not None:
         return agent
     if discount == 1.0:
         raise MerlError(
-            "replay.discount 1 leaves returns without a bound, and agent.critic-loss "
-            f"{agent.critic_loss} needs one: give --agent.critic-high"
+            "with replay.discount 1 returns have no upper bound, but agent.critic-loss "
+            f"{agent.critic_loss} needs one: set --agent.critic-high"
         )
-    high = round(1.0 / (1.0 - discount), 6)  # not 99.99999999999991
+    high = round(1.0 / (1.0 - discount), 6)  # 100, not 99.99999999999991
     return dataclasses.replace(agent, critic_high=high)
 
 
@@ -169,8 +171,8 @@ def choose_device(name: str) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and not torch.cuda.is_available():
-        raise MerlError("--device cuda: no CUDA device is found here; use --device cpu or auto")
-    if name == "cuda":  # a run's shapes never change: trying every way to convolve once pays
+        raise MerlError("--device cuda: no CUDA device was found; use --device cpu or auto")
+    if name == "cuda":  # shapes are fixed: timing cuDNN's convolution algorithms once pays off
         torch.backends.cudnn.benchmark = True
     return torch.device(name)
 
@@ -184,11 +186,10 @@ def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.B
     """Reject networks or batches that cannot fit into the memory of this process.
 
     The estimate counts the weights with gradient, Adam's moments and average, and the batch's
-    inputs with the output of one layer. It is below what an update takes, so that nothing that fits
-    is rejected.
+    inputs with the output of one layer. An update takes more, so nothing that fits is rejected.
 
     Raises:
-        MerlError: names what is too large.
+        MerlError: the networks or the batch are too large.
     """
     with torch.device("meta"):
         networks = make_networks(
@@ -197,10 +198,10 @@ def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.B
     weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
     stack, size = config.replay.frame_stack, config.replay.batch_size
     inputs = 2 * 5 * size * sum(math.prod(s.shape or ()) * stack for s in space.values())
-    room = available_memory()
-    for what, need in (("networks of agent.*", weights), (f"replay.batch-size {size}", inputs)):
-        if need > room:
+    available = available_memory()
+    for name, need in (("networks of agent.*", weights), (f"replay.batch-size {size}", inputs)):
+        if need > available:
             raise MerlError(
-                f"{what} would take {need / 1e9:.3g} GB or more, but {room / 1e9:.3g} GB of memory "
-                "are available: make it smaller"
+                f"{name} would take {need / 1e9:.3g} GB or more, but {available / 1e9:.3g} GB of "
+                "memory are available: use smaller values"
             )

@@ -1,7 +1,7 @@
-"""Time an update and a step on this machine, once, before a run begins.
+"""Time an update and an environment step on this machine, once, before a run starts.
 
 Updates and acting are timed with synthetic observations. A user's own environment is timed only if
-`TrainConfig.measure` is set: it may be a robot, which must not move before the run begins.
+`TrainConfig.measure` is set: it may be a robot, which must not move before the run starts.
 """
 
 from __future__ import annotations
@@ -30,39 +30,42 @@ from merl.training.loop import Update
 from merl.training.updating import Recorded
 
 REPEATS = 3
+"""Number of measurements, of which the median counts."""
 REPEATS_ON_GPU = 30
-"""Repeats of an update on a GPU, where it takes a few milliseconds."""
+"""Number of measurements of an update on a GPU, where it takes a few milliseconds."""
 MEASURED_STEPS = 25
+"""Environment steps of one measurement."""
 THREADS_PAY = 1.3
-"""How many times faster several threads must be than one to be chosen. They wait for each other in
-every operation: if another process takes a core, they can become ten times slower than one."""
+"""Minimum speedup over one thread for which several threads are chosen. Threads wait for each other
+in every operation: if another process uses a core, they can be ten times slower than one."""
 BF16_PAYS = 1.1
-"""How many times faster than fp32 an update must be in bf16 for bf16 to be chosen: where both are
-equally fast, the same command should give the same run."""
+"""Minimum speedup over fp32 for which bf16 is chosen. If both are about equally fast, every run of
+the same command must make the same choice."""
 WORTH_COMPILING = 1800.0
-"""Seconds that a run must take before a compiled update is tried, which takes a minute or two."""
+"""Minimum duration of a run, in seconds, for which a compiled update is tried; trying it takes a
+minute or two."""
 
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """How updates are computed."""
+    """Precision, threads and compilation of the updates."""
 
     precision: Literal["fp32", "bf16"]
     threads: int
     compiled: bool = False
 
     def __str__(self) -> str:
-        how = f"{self.precision}, compiled," if self.compiled else self.precision
-        return f"{how} on {counted(self.threads, 'thread')}"
+        kind = f"{self.precision}, compiled," if self.compiled else self.precision
+        return f"{kind} on {counted(self.threads, 'thread')}"
 
     @property
     def must_gain(self) -> float:
-        """Return how many times faster than fp32 on one thread it must be to be chosen."""
+        """Return the minimum speedup over fp32 on one thread for which this is chosen."""
         precision = BF16_PAYS if self.precision == "bf16" else 1.0
         return precision * (THREADS_PAY if self.threads > 1 else 1.0)
 
     def decided(self, config: AgentConfig) -> AgentConfig:
-        """Return the config with precision and compilation decided."""
+        """Return the config with this precision and compilation."""
         torch_compile: Literal["yes", "no"] = "yes" if self.compiled else "no"
         return dataclasses.replace(config, precision=self.precision, torch_compile=torch_compile)
 
@@ -72,12 +75,13 @@ class Timing:
     """Measured times, in seconds.
 
     Attributes:
-        update: of one update, for each arithmetic that was tried.
-        step: of acting and one step of the run's environment, with its images; with
-            `action_repeat`, of one action.
-        frame: of one frame of a video; 0 without videos.
-        not_compiled: why updates cannot be compiled, if that was tried.
-        knows_env: whether `step` includes the environment's step; if not, it is acting alone.
+        update: time of one update, for each arithmetic that was tried.
+        step: time of choosing an action and of one step of the run's environment, including its
+            images; with `action_repeat`, of all steps of one action.
+        frame: time of one frame of a video; 0 without videos.
+        not_compiled: why updates cannot be compiled; None if compilation works or was not tried.
+        knows_env: whether `step` includes the environment's step; if not, it is only the time of
+            choosing an action.
     """
 
     update: Mapping[Arithmetic, float]
@@ -89,23 +93,23 @@ class Timing:
     @property
     def best(self) -> Arithmetic:
         """Return the fastest arithmetic; bf16 and more threads only if they are clearly faster."""
-        return min(self.update, key=lambda how: self.update[how] * how.must_gain)
+        return min(self.update, key=lambda kind: self.update[kind] * kind.must_gain)
 
     def seconds(self, config: TrainConfig, done: int = 0) -> float:
-        """Return the time that a run takes from step `done` on, evaluations included.
+        """Return the time of a run from step `done` to its end, including evaluations.
 
-        Without the environment's step (`knows_env`) this is a lower bound.
+        The time is a lower bound if `step` does not include the environment's step (`knows_env`).
         """
         steps = max(0, config.steps - done)
         repeat = config.action_repeat
         updates = (config.steps - max(done, config.seed_steps)) * config.updates_per_step
         count = config.eval.count(steps)
         evaluations = count * config.eval.episodes
-        length = 250 / repeat  # actions of an episode, roughly
+        length = 250 / repeat  # assumed number of actions in an episode
         videos = {"each": count, "last": min(1, count), "none": 0}[config.eval.video]
-        whole = max(0.0, updates) * self.update[self.best] + videos * length * self.frame
-        whole += (steps / repeat + evaluations * length) * self.step
-        return min(whole, (config.minutes or float("inf")) * 60)
+        total = max(0.0, updates) * self.update[self.best] + videos * length * self.frame
+        total += (steps / repeat + evaluations * length) * self.step
+        return min(total, (config.minutes or float("inf")) * 60)
 
 
 def measure(
@@ -115,10 +119,18 @@ def measure(
     space: spaces.Dict,
     device: torch.device,
 ) -> Timing:
-    """Time the update in every arithmetic that the config leaves open, and the environment's step.
+    """Time the update in every arithmetic that the config allows, and the environment's step.
 
-    Try the precisions on one thread, then the faster one on all threads, or compiled on a GPU. Do
-    not touch a user's own environments unless `config.measure` is set.
+    On a CPU, try the precisions on one thread, then the fastest on all threads. On a GPU, use all
+    threads, and also try the fastest precision compiled. Do not reset, step or render a user's own
+    environments unless `config.measure` is set.
+
+    Args:
+        config: the config of the run.
+        env: the environment for training.
+        eval_env: the environment for evaluations, which renders the videos.
+        space: the observation space of the agent.
+        device: device of the networks.
 
     Raises:
         MerlError: the config asks for a compiled update, and compilation fails.
@@ -130,7 +142,7 @@ def measure(
     )
     assert isinstance(env.action_space, spaces.Box)
     with torch_settings(device):
-        batch = random_batch(config, space, env.action_space)  # as from replay: on the host
+        batch = random_batch(config, space, env.action_space)  # on the host, like replay batches
     update: dict[Arithmetic, float] = {}
 
     def attempt(arithmetic: Arithmetic) -> DDPG:
@@ -156,13 +168,13 @@ def measure(
         step, frame = _time_acting(agent, batch), 0.0
     knows_env = config.measure or not config.own_env
     if knows_env:
-        films = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
-        frame = _time_frame(eval_env) if films else 0.0
+        makes_videos = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
+        frame = _time_frame(eval_env) if makes_videos else 0.0
         step += _time_step(env)
     timing = Timing(update, step, frame, knows_env=knows_env)
     if not worth_compiling(config, timing, device):
         return timing
-    print("merl: trying torch.compile, once, for a minute or two", file=sys.stderr)
+    print("merl: trying torch.compile once, which takes a minute or two", file=sys.stderr)
     try:
         attempt(dataclasses.replace(fastest, compiled=True))
     except _CompileError as failure:
@@ -173,7 +185,7 @@ def measure(
 def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -> bool:
     """Return whether to try a compiled update: on a GPU, for a long run, if the config allows it.
 
-    On a CPU it was never faster (docs/bench.md).
+    On a CPU a compiled update was never faster (docs/bench.md).
     """
     left_open = config.agent.torch_compile == "auto"
     return left_open and device.type == "cuda" and timing.seconds(config) > WORTH_COMPILING
@@ -185,7 +197,7 @@ def use_threads(count: int) -> None:
 
 
 def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:
-    """Return a batch of noise in the form of a replay batch, the same for the same config."""
+    """Return random values in the form of a replay batch; the same config gives the same batch."""
     generator = torch.Generator().manual_seed(0)
     size, stack = config.replay.batch_size, config.replay.frame_stack
 
@@ -226,32 +238,34 @@ def _agent(
 
 
 def _time_update(agent: DDPG, batch: Batch) -> float:
-    make: Update = partial(agent.update, batch)
-    first, repeats = 1, REPEATS  # the first one sets up what the others use
-    if agent.device.type == "cuda":  # as training does there
-        there = batch.to(agent.device)
-        make, first, repeats = Recorded(agent, lambda: there), Recorded.WARM_UP + 1, REPEATS_ON_GPU
+    update: Update = partial(agent.update, batch)
+    warm_up, repeats = 1, REPEATS  # the first update also initialises, e.g. the optimizers
+    if agent.device.type == "cuda":  # time the kind of update that training uses there
+        on_device = batch.to(agent.device)
+        update, repeats = Recorded(agent, lambda: on_device), REPEATS_ON_GPU
+        warm_up = Recorded.WARM_UP + 1
 
-    # Not every update moves the actor: time a whole cycle of updates.
+    # Not every update includes the actor: time a whole cycle of updates.
     cycle = agent.config.actor_every
 
     def updates() -> None:
         for _ in range(cycle):
-            metrics = make()
+            metrics = update()
         float(metrics["critic_loss"])  # reading it waits for the device
 
-    for _ in range(first):
+    for _ in range(warm_up):
         updates()
     return _median_seconds(updates, repeats) / cycle
 
 
 class _CompileError(MerlError):
-    """The compiled update does not run on this machine."""
+    """A compiled update does not run on this machine."""
 
     def __init__(self, error: Exception) -> None:
         self.reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         super().__init__(
-            f"agent.torch-compile yes: the compiled update fails here ({self.reason}): leave it out"
+            f"agent.torch-compile yes: the compiled update fails here ({self.reason}): use "
+            "--agent.torch-compile no"
         )
 
 
@@ -284,10 +298,10 @@ def _time_frame(env: gymnasium.Env[Any, Any]) -> float:
     return _median_seconds(env.render)
 
 
-def _median_seconds(work: Callable[[], object], repeats: int = REPEATS) -> float:
+def _median_seconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        work()
+        function()
         seconds.append(time.perf_counter() - start)
     return median(seconds)

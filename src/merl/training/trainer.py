@@ -1,4 +1,4 @@
-"""Train a run from its first step, or from a checkpoint, to its end."""
+"""The trainer of a run, from its first step or a checkpoint to its end."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ from merl.training.setup import Setup
 from merl.training.updating import make_update
 
 LONG = 2000
-"""Steps without the end of an episode after which the user is warned; or half of the run's steps,
-if that is less."""
+"""Steps per environment without the end of an episode after which the user is warned; the limit is
+half of the run's steps if these are fewer."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended.
+    """The outcome of a run.
 
     Attributes:
-        run: its folder and config.
-        progress: its counts of steps, updates and episodes.
-        evaluation: the last one, if there was any.
-        signal: the number of the signal that interrupted it; None if it ran to its end.
-        saved: whether its last checkpoint is on the disk.
+        run: folder and config of the run.
+        progress: counts of steps, updates and episodes.
+        evaluation: the last evaluation; None if there was none.
+        signal: number of the signal that stopped the run; None if no signal stopped it.
+        saved: whether a checkpoint of the final state is on the disk.
         unwritten: rows of metrics that could not be written.
     """
 
@@ -65,27 +65,28 @@ class Outcome:
 
 
 class Trainer:
-    """Trains the agent of a run: acts, learns, evaluates, logs and saves.
+    """Trainer of a run's agent: acts, learns, evaluates, logs and saves.
 
-    A context manager, which closes the environments at its end:
+    The trainer is a context manager that closes the environments at the end:
 
         with Trainer(config, callbacks) as trainer:
             outcome = trainer.fit()
 
     Args:
-        config: the run's values.
-        callbacks: called while it trains.
-        resumed: the run to resume, whose lock the caller holds, and the checkpoint to resume from;
-            without a checkpoint it starts at its first step. None: a new run.
+        config: the run's config.
+        callbacks: called at the events of training.
+        resumed: None for a new run; else the run to resume, whose lock the caller holds, and the
+            checkpoint to resume from, or None to start at the first step.
 
     Attributes:
         setup: environments, agent, progress and random streams.
-        config: the run's values, with what this machine decided.
+        config: the run's config, with the values that were chosen for this machine.
         run: the run's folder; set by `fit`.
         replay: the replay buffer; set by `fit`.
 
     Raises:
-        MerlError: the config cannot work here, or the environment is not that of the resumed run.
+        MerlError: the config cannot work on this machine, or the environment differs from that of
+            the resumed run.
     """
 
     run: Run
@@ -109,8 +110,9 @@ class Trainer:
         self._callbacks = CallbackList(callbacks)
         self._averages, self._guard = Averages(), LossGuard()
         self._worker_losses = 0
-        self._asked_to_stop = False  # by a callback
-        self._episode_end: int | None = None  # step of the last one; None once the user is warned
+        self._callback_stops = False  # a callback returned False
+        # Step of the last end of an episode; None once the user is warned.
+        self._episode_end: int | None = None
 
     def __enter__(self) -> Trainer:
         """Return the trainer."""
@@ -121,17 +123,18 @@ class Trainer:
         self._resources.close()
 
     def fit(self) -> Outcome:
-        """Train to the end of the run, or until it is stopped; call it once.
+        """Train until the run ends or is stopped; call this method once.
 
         A signal stops the run at the next safe point, with a checkpoint. A new run that fails
         before its first step leaves no folder.
 
         Raises:
             EnvironmentFailed: the user's environment failed; the run can be resumed.
-            EnvironmentsLost: environments' processes died too often; the run can be resumed.
+            EnvironmentsLost: worker processes died too often; the run can be resumed.
             EvaluationFailed: an evaluation failed; the run can be resumed.
             NotFinite: an observation or a reward is NaN or infinite, and the run can be resumed; or
-                a loss or a weight is, and nothing newer than the last checkpoint is usable.
+                a loss or a weight is NaN or infinite, and the run can be resumed from its last
+                checkpoint only.
         """
         setup = self.setup
         if self._resumed is not None:
@@ -153,7 +156,7 @@ class Trainer:
                 raise
 
     def _fit(self, run: Run, start: Checkpoint | None) -> Outcome:
-        """Open what the run needs, restore it, and train."""
+        """Open replay, metrics and environments, restore the run if it resumes, and train."""
         self.run, setup = run, self.setup
         self._clock = Clock()
         with ExitStack() as stack:
@@ -200,35 +203,35 @@ class Trainer:
         return WorkerEnvs(self.config, env) if self.config.has_workers else InProcessEnvs(env)
 
     def _train_and_rescue(self) -> Outcome:
-        """Train; after an error, save before raising it.
+        """Train; after an error, save the run and raise the error.
 
-        Once a signal has arrived, the run ends as stopped, whatever fails because of the signal.
+        After a signal, the run counts as stopped, also if the signal made something fail.
         """
         try:
             return self._train()
         except BaseException as error:
-            if isinstance(error, KeyboardInterrupt):  # raised by a handler of the environment
+            if isinstance(error, KeyboardInterrupt):  # raised by the environment's signal handler
                 self._interrupt.note(signal.SIGINT)
             if self._interrupt.number is not None:
                 return self._outcome(self._saver.save())
             step, line = self.setup.progress.step, resume_line(self.run.path)
             if isinstance(error, EvaluationFailed | EnvironmentsLost) or not self._rescue():
                 raise
-            saved = f"the run is saved at step {step:,}: mend it, and resume with `{line}`"
+            saved = f"the run is saved at step {step:,}: fix the cause, and resume with `{line}`"
             if isinstance(error, EnvironmentFailed | NotFinite):
                 raise type(error)(f"{error}; {saved}") from error
             self._callbacks.on_warning(saved)
             raise
 
     def _rescue(self) -> bool:
-        """Save after an error, if there is anything to save; return whether it succeeded."""
+        """Save after an error, if a step was taken; return whether the state is on the disk."""
         try:
             return self.setup.progress.step > 0 and self._saver.save()
-        except Exception:  # the weights are not finite, or the folder is gone
+        except Exception:  # a loss or a weight is not finite, or the folder is gone
             return False
 
     def _train(self) -> Outcome:
-        """Run the loop of Algorithm 1; between its steps log, evaluate and save."""
+        """Run the loop of Algorithm 1; log, evaluate and save between its steps."""
         progress = self.setup.progress
         steps = self._steps()
         self._callbacks.on_start(self)
@@ -239,8 +242,8 @@ class Trainer:
             )
         if progress.step == 0 and not self._saver.save():
             raise MerlError(
-                f"no checkpoint can be written into {self.run.path}: make room on its disk, or "
-                "name a folder on another with --run-dir"
+                f"no checkpoint can be written to {self.run.path}: free space on its disk, or "
+                "choose a folder on another disk with --run-dir"
             )
         if progress.step and self._evaluations.are_due() and not self.replay.state_dict()["open"]:
             self._evaluate()  # the run was stopped before this evaluation or within it
@@ -250,9 +253,9 @@ class Trainer:
         for count, result in enumerate(steps):
             if count == 0 and not result.lost and not self._saver.resumes_exactly():
                 self._callbacks.on_warning(
-                    "a resumed run will meet other episodes than this one would, unless the "
-                    "environment draws from Gymnasium's np_random, or from the global generators "
-                    "of NumPy, Python or torch"
+                    "a resumed run will have other episodes than an uninterrupted run, unless the "
+                    "environment draws its random numbers from Gymnasium's np_random, or from the "
+                    "global generators of NumPy, Python or torch"
                 )
             self._handle(result)
             if self._is_to_stop():
@@ -268,7 +271,7 @@ class Trainer:
         return self._outcome(self._saver.save())
 
     def _steps(self) -> Iterable[StepResult]:
-        """Return the loop of Algorithm 1, which yields after every step."""
+        """Return the loop of Algorithm 1, which yields after every step of the environments."""
         setup = self.setup
         images = tuple(key for key in setup.space if is_image(setup.space[key]))
         stacks = [
@@ -303,7 +306,7 @@ class Trainer:
         if result.learning:
             self._callbacks.on_update(result.step, result.learning)
         if self._callbacks.on_step(result) is False:
-            self._asked_to_stop = True
+            self._callback_stops = True
         if result.episodes:
             self._callbacks.on_episode(result.step, self._log(result))
 
@@ -312,23 +315,23 @@ class Trainer:
         return Outcome(self.run, self.setup.progress, self._evaluations.last, number, saved)
 
     def _watch_for_episode_end(self, result: StepResult) -> None:
-        """Warn once if no episode ends: metrics and evaluations wait for that."""
-        long = min(LONG * self._environments.count, max(1, self.config.steps // 2))
+        """Warn once if no episode ends, since metrics and evaluations wait for that."""
+        most = min(LONG * self._environments.count, max(1, self.config.steps // 2))
         if result.episodes:
             self._episode_end = result.step
-        elif self._episode_end is not None and result.step - self._episode_end > long:
+        elif self._episode_end is not None and result.step - self._episode_end > most:
             self._episode_end = None
             self._callbacks.on_warning(
-                f"no episode has ended in {long:,} steps, and nothing is logged or evaluated until "
-                "one does: an environment whose episodes have no end needs "
+                f"no episode has ended in {most:,} steps, and nothing is logged or evaluated until "
+                "one ends: if episodes have no end, wrap the environment in "
                 "gymnasium.wrappers.TimeLimit"
             )
 
-    def _count_worker_loss(self, what: str) -> None:
-        """Count the death of a worker; the loop restarts the environments.
+    def _count_worker_loss(self, cause: str) -> None:
+        """Count the death of a worker process; the loop restarts the environments.
 
         Raises:
-            EnvironmentsLost: too many deaths; the run is saved.
+            EnvironmentsLost: worker processes died too often; the run is saved.
         """
         self._worker_losses += 1
         most = self.config.worker_restarts
@@ -337,19 +340,19 @@ class Trainer:
             step = self.setup.progress.step
             saved = f"the run is saved at step {step:,}; resume with `{resume_line(self.run.path)}`"
             raise EnvironmentsLost(
-                f"an environment's process {what}, after {counted(most, 'restart')}: "
+                f"an environment's process {cause}, after {counted(most, 'restart')}: "
                 + (saved if step else "the run ends before its first step")
             )
         self._callbacks.on_warning(
-            f"an environment's process {what}: starting the environments again (restart "
+            f"an environment's process {cause}: starting the environments again (restart "
             f"{self._worker_losses} of {most})"
         )
 
     def _is_to_stop(self) -> bool:
-        """Return whether a signal, a callback, or the limit of minutes stops the run."""
+        """Return whether a signal, a callback or the time limit stops the run."""
         minutes = self.config.minutes
         spent = minutes is not None and self._clock.stretch() > minutes * 60
-        return spent or self._asked_to_stop or self._interrupt.number is not None
+        return spent or self._callback_stops or self._interrupt.number is not None
 
     def _at_episode_end(self) -> None:
         if self._evaluations.are_due():
@@ -359,7 +362,7 @@ class Trainer:
             self._saver.save()
 
     def _log(self, result: StepResult) -> dict[str, float]:
-        """Write a row of metrics for the episodes that ended, and return it."""
+        """Write a row of metrics for the episodes that ended at this step, and return it."""
         self._guard.check()
         self.run.check_there()
         progress = self.setup.progress
@@ -376,4 +379,4 @@ class Trainer:
 
     def _evaluate(self, last: bool = False) -> None:
         self._evaluations.run(self._saver.save, self._clock, last=last)
-        self._clock.mark(self.setup.progress)  # evaluating does not count against the speed
+        self._clock.mark(self.setup.progress)  # the rates do not include the evaluation

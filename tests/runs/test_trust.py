@@ -220,7 +220,8 @@ def test_a_module_is_loaded_from_its_folder_and_replaces_no_other(tmp_path: Path
     assert module.__file__ == str(tmp_path / "colorsys.py")
     assert module_folder("colorsys:make") == tmp_path
     assert sys.path[-1] == str(tmp_path)
-    with pytest.raises(MerlError, match=r"json\.py cannot be imported, because another module is named 'json'"):
+    says = r"json\.py cannot be imported, because another module is named 'json'"
+    with pytest.raises(MerlError, match=says):
         load_module("json:make", tmp_path)
     assert sys.modules["json"] is json
 

@@ -1,4 +1,4 @@
-"""However a run ends, what was learnt is saved: evaluations, videos and reports that fail."""
+"""Ends of a run: failing evaluations, videos and reports, and signals leave a saved run."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _FLAGS = {
     "--eval.video": "none",
     "--steps": 60,
 }
-FLAGS = [str(part) for flag in _FLAGS.items() for part in flag]
+FLAGS = [str(word) for flag in _FLAGS.items() for word in flag]
 
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    """In a folder of its own; nothing is timed or drawn, and no references are measured."""
+    """Run each test in a new folder, without timing and drawing."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
@@ -53,8 +53,8 @@ def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     unruly_envs.made.clear()
 
 
-def train(*flags: str, which: str = "make") -> int:
-    line = ["train", f"unruly_envs:{which}", *FLAGS, "--eval.no-references", "--run-dir", "run"]
+def train(*flags: str, function: str = "make") -> int:
+    line = ["train", f"unruly_envs:{function}", *FLAGS, "--eval.no-references", "--run-dir", "run"]
     return main([*line, *flags])
 
 
@@ -64,31 +64,31 @@ def saved() -> list[int]:
 
 def evaluated() -> list[int]:
     metrics = read_metrics("run")
-    there = np.isfinite(metrics.get("eval/return", np.full(len(metrics["step"]), np.nan)))
-    return metrics["step"][there].astype(int).tolist()
+    has_return = np.isfinite(metrics.get("eval/return", np.full(len(metrics["step"]), np.nan)))
+    return metrics["step"][has_return].astype(int).tolist()
 
 
 @pytest.mark.parametrize(
-    ("act", "every", "code", "says"),
+    ("act", "every", "code", "message"),
     [
         (unruly_envs.fail, 20, 4, "raised OSError: the camera is gone (unruly_envs.py, line"),
         (unruly_envs.run_out_of_memory, 1000, 4, "raised MemoryError"),
         (unruly_envs.give_nan, 1000, 3, "reward is nan at step 1 of an evaluation"),
     ],
 )
-def test_an_evaluation_that_fails_leaves_a_saved_run_that_can_be_resumed(
-    act: Any, every: int, code: int, says: str, capsys: pytest.CaptureFixture[str]
+def test_a_failing_evaluation_leaves_a_saved_run_that_can_be_resumed(
+    act: Any, every: int, code: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     unruly.in_evaluation = act
     assert train("--eval.every", str(every)) == code
     step = min(every, 60)
     error = capsys.readouterr().err.strip()
     assert f"the evaluation at step {step} failed: " in error
-    assert says in error
+    assert message in error
     assert f"merl resume {Path.cwd() / 'run'}`" in error
     assert len(error.splitlines()) == 1
     assert saved()[-1] == step
-    # It is repeated once; one that still fails is left out, and the run comes to its end.
+    # Resume repeats the evaluation; if it fails again, it is skipped, and the run completes.
     assert main(["resume", "run"]) == 0
     assert "the run continues without it" in " ".join(capsys.readouterr().out.split())
     assert saved()[-1] == 60
@@ -97,22 +97,22 @@ def test_an_evaluation_that_fails_leaves_a_saved_run_that_can_be_resumed(
     assert "is done" in capsys.readouterr().out
 
 
-def test_a_resumed_run_repeats_the_evaluation_that_failed() -> None:
-    """And is what it would have been without the failure."""
+def test_resume_repeats_a_failed_evaluation() -> None:
+    """The metrics equal those of a run without the failure."""
     unruly.in_evaluation = unruly_envs.fail
     assert train() == 4
     unruly.in_evaluation = None
     assert main(["resume", "run"]) == 0
     assert evaluated() == [20, 40, 60]
-    failed = read_metrics("run")
-    Path("run").rename("failed")
+    resumed = read_metrics("run")
+    Path("run").rename("resumed")
     assert train() == 0
     for name, values in read_metrics("run").items():
         if not name.startswith("time/"):
-            np.testing.assert_array_equal(values, failed[name], err_msg=name)
+            np.testing.assert_array_equal(values, resumed[name], err_msg=name)
 
 
-def test_a_run_whose_last_evaluation_failed_is_evaluated_when_resumed() -> None:
+def test_resume_repeats_a_failed_last_evaluation() -> None:
     unruly.in_evaluation = unruly_envs.fail
     assert train("--eval.every", "1000") == 4
     unruly.in_evaluation = None
@@ -121,11 +121,11 @@ def test_a_run_whose_last_evaluation_failed_is_evaluated_when_resumed() -> None:
     assert evaluated() == [60]
 
 
-def test_an_evaluation_that_is_killed_again_and_again_is_left_out(
+def test_an_evaluation_that_is_killed_repeatedly_is_skipped(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Killed(BaseException):
-        """Nobody handles it, as SIGKILL."""
+        """An exception that no code handles, like SIGKILL."""
 
     def killed(env: Any, seen: Any) -> Any:
         raise Killed
@@ -138,13 +138,13 @@ def test_an_evaluation_that_is_killed_again_and_again_is_left_out(
         with pytest.raises(Killed):
             main(["resume", "run"])
     assert main(["resume", "run"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "the evaluation at step 60 was begun 3 times and never finished" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "the evaluation at step 60 was started 3 times and never finished" in printed
     assert main(["resume", "run"]) == 0
     assert "is done" in capsys.readouterr().out
 
 
-def test_an_exception_of_merls_own_in_an_evaluation_is_one_line(
+def test_an_exception_of_merl_in_an_evaluation_is_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def full(*_: Any, **__: Any) -> None:
@@ -158,7 +158,7 @@ def test_an_exception_of_merls_own_in_an_evaluation_is_one_line(
     assert saved()[-1] == 20
 
 
-def test_an_evaluation_without_end_is_cut(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_evaluation_episode_without_end_is_truncated(capsys: pytest.CaptureFixture[str]) -> None:
     def endless(env: Any, seen: Any) -> Any:
         env.taken = 1
         return seen
@@ -166,22 +166,22 @@ def test_an_evaluation_without_end_is_cut(capsys: pytest.CaptureFixture[str]) ->
     unruly.in_evaluation = endless
     assert train("--eval.max-episode-steps", "30") == 0
     assert evaluated() == [20, 40, 60]
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.count("was cut after 30 steps and counts as truncated") == 1
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed.count("was cut after 30 steps and counts as truncated") == 1
     assert main(["evaluate", "run", "--episodes", "1"]) == 0
     assert "was cut after 30 steps" in capsys.readouterr().err
     assert main(["evaluate", "run", "--episodes", "1", "--max-episode-steps", "7"]) == 0
     assert "was cut after 7 steps" in capsys.readouterr().err
 
 
-def test_references_without_end_are_cut(capsys: pytest.CaptureFixture[str]) -> None:
+def test_reference_episodes_without_end_are_truncated(capsys: pytest.CaptureFixture[str]) -> None:
     unruly.length = 10**9
     flags = ["--eval.references", "--eval.max-episode-steps", "5", "--eval.every", "1000"]
     assert train(*flags) == 0
     assert "random actions" in capsys.readouterr().out
 
 
-def test_a_report_that_fails_costs_nothing(
+def test_a_failing_report_does_not_fail_the_run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def broken(*_: Any, **__: Any) -> None:
@@ -190,23 +190,23 @@ def test_a_report_that_fails_costs_nothing(
     for part in ("report.figures.learning_curve", "cli.summary.floors"):
         monkeypatch.setattr(f"merl.{part}", broken)
     assert train("--eval.references") == 0
-    said = capsys.readouterr().out
-    assert "the curve was not drawn: MemoryError" in said
-    assert "there is nothing to compare with: MemoryError" in said
-    assert f"merl resume {Path.cwd() / 'run'}" in " ".join(said.split())
+    printed = capsys.readouterr().out
+    assert "the curve was not drawn: MemoryError" in printed
+    assert "there is nothing to compare with: MemoryError" in printed
+    assert f"merl resume {Path.cwd() / 'run'}" in " ".join(printed.split())
 
 
-def test_a_video_without_a_frame_rate_has_25_frames_a_second(
+def test_a_video_without_a_frame_rate_has_25_frames_per_second(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     unruly.metadata = None
     assert train("--eval.video", "each", "--action-repeat", "2") == 0
     assert len(list(Path("run/videos").glob("*.mp4"))) == 3
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.count("no usable render_fps: its videos have 25 frames per second") == 1
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed.count("no usable render_fps: its videos have 25 frames per second") == 1
 
 
-def test_a_video_of_wrong_frames_is_dropped_with_one_warning(
+def test_a_video_with_invalid_frames_is_dropped_with_one_warning(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     frame = np.zeros((32, 32, 3), np.uint8)
@@ -217,24 +217,25 @@ def test_a_video_of_wrong_frames_is_dropped_with_one_warning(
     assert capsys.readouterr().out.count("there is no video of this evaluation") == 1
 
 
-@pytest.mark.parametrize("how", ["numpy", "python", "own", "one object"])
-def test_evaluations_do_not_change_what_training_draws(how: str) -> None:
-    """And other seeds give other episodes."""
+@pytest.mark.parametrize("source", ["numpy", "python", "own", "one object"])
+def test_evaluations_do_not_change_the_random_numbers_of_training(source: str) -> None:
+    """Another seed of the run gives other episodes."""
 
     def reseed(env: Any, seed: int | None) -> None:
-        if seed is not None and how == "numpy":
+        if seed is not None and source == "numpy":
             np.random.seed(seed % 2**32)  # noqa: NPY002
-        if seed is not None and how == "own":
+        if seed is not None and source == "own":
             env.rng = np.random.default_rng(seed)
 
     unruly.on_reset = reseed
-    if how != "one object":
-        unruly.draw = getattr(unruly_envs, {"own": "from_own_generator"}.get(how, f"from_{how}"))
-    which = "one" if how in ("own", "one object") else "make"
+    if source != "one object":
+        name = "from_own_generator" if source == "own" else f"from_{source}"
+        unruly.draw = getattr(unruly_envs, name)
+    function = "one" if source in ("own", "one object") else "make"
     returns = {}
     for name, flags in {"often": [], "never": ["--eval.every", "0"], "1": ["--seed", "1"]}.items():
         unruly_envs.made.clear()
-        assert train(*flags, which=which) == 0
+        assert train(*flags, function=function) == 0
         returns[name] = read_metrics("run")["train/return"].tolist()
         Path("run").rename(name)
     assert len(set(returns["often"])) == len(returns["often"])
@@ -242,15 +243,15 @@ def test_evaluations_do_not_change_what_training_draws(how: str) -> None:
     assert not set(returns["often"]) & set(returns["1"])
 
 
-@pytest.mark.parametrize("how", ["from_numpy", "from_python"])
-def test_a_resumed_run_draws_on_from_the_global_generators(how: str) -> None:
-    unruly.draw = getattr(unruly_envs, how)
+@pytest.mark.parametrize("draw", ["from_numpy", "from_python"])
+def test_resume_restores_the_global_generators(draw: str) -> None:
+    unruly.draw = getattr(unruly_envs, draw)
     assert train() == 0
-    whole = read_metrics("run")["train/return"]
-    Path("run").rename("whole")
+    uninterrupted = read_metrics("run")["train/return"]
+    Path("run").rename("uninterrupted")
     assert train("--steps", "30", "--eval.every", "1000") == 0
     assert main(["resume", "run", "--steps", "60"]) == 0
-    np.testing.assert_array_equal(read_metrics("run")["train/return"], whole)
+    np.testing.assert_array_equal(read_metrics("run")["train/return"], uninterrupted)
 
 
 def test_without_evaluations_the_environment_is_made_once(
@@ -258,10 +259,10 @@ def test_without_evaluations_the_environment_is_made_once(
 ) -> None:
     assert train("--eval.every", "0", "--eval.video", "each", "--eval.references") == 0
     assert len(unruly_envs.made) == 1
-    said = " ".join(capsys.readouterr().out.split())
-    assert "is trained and saved, and not evaluated" in said
-    assert "resume with" in said
-    assert "warning" not in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "is trained and saved, and not evaluated" in printed
+    assert "resume with" in printed
+    assert "warning" not in printed
     assert evaluated() == []
     assert main(["resume", "run"]) == 0
     assert "is done" in capsys.readouterr().out
@@ -270,23 +271,23 @@ def test_without_evaluations_the_environment_is_made_once(
     assert main(["evaluate", "run", "--episodes", "1"]) == 0
 
 
-def test_one_object_for_training_and_evaluation_is_warned_of(
+def test_one_environment_object_for_training_and_evaluation_gives_a_warning(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert train(which="one") == 0
+    assert train(function="one") == 0
     assert "use the same environment object" in capsys.readouterr().err
     Path("run").rename("once")
-    assert train("--eval.every", "0", which="one") == 0
+    assert train("--eval.every", "0", function="one") == 0
     assert capsys.readouterr().err == ""
 
 
 def test_an_environment_may_change_the_working_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert train(which="wanders") == 0
+    assert train(function="wanders") == 0
     assert Path.cwd() == Path("/")
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"merl resume {tmp_path}/run" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"merl resume {tmp_path}/run" in printed
     line = ["train", "unruly_envs:wanders", *FLAGS, "--eval.no-references"]
     for command in (
         ["resume", "run", "--steps", "80"],
@@ -313,20 +314,20 @@ def test_an_environment_may_change_the_working_folder(
         (signal.SIGTERM, SystemExit(1)),
     ],
 )
-def test_a_simulator_that_dies_of_the_signal_does_not_make_it_a_failure(
+def test_an_exception_caused_by_a_signal_counts_as_a_stop(
     number: int, error: BaseException, capsys: pytest.CaptureFixture[str]
 ) -> None:
     unruly.in_training = unruly_envs.interrupted(number, error)
     assert train() == 128 + number
-    said = capsys.readouterr()
-    assert "and saved: resume with" in said.out
-    assert said.err == ""
+    printed = capsys.readouterr()
+    assert "and saved: resume with" in printed.out
+    assert printed.err == ""
     unruly.in_training = None
     assert main(["resume", "run"]) == 0
     assert saved()[-1] == 60
 
 
-def test_a_simulator_that_dies_of_the_signal_in_an_evaluation_neither() -> None:
+def test_an_exception_caused_by_a_signal_in_an_evaluation_counts_as_a_stop() -> None:
     unruly.in_evaluation = unruly_envs.interrupted(signal.SIGINT, RuntimeError("rpc failed"))
     assert train("--eval.episodes", "5") == 130
     unruly.in_evaluation = None
@@ -334,7 +335,7 @@ def test_a_simulator_that_dies_of_the_signal_in_an_evaluation_neither() -> None:
     assert evaluated() == [20, 40, 60]
 
 
-def test_a_handler_of_the_environments_does_not_make_ctrl_c_useless(
+def test_ctrl_c_stops_the_run_despite_a_handler_of_the_environment(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     before = signal.getsignal(signal.SIGINT)
@@ -344,10 +345,10 @@ def test_a_handler_of_the_environments_does_not_make_ctrl_c_useless(
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_an_episode_without_end_is_saved_and_warned_of(
+def test_an_episode_without_end_is_saved_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is killed once it has been saved, as by SIGKILL."""
+    """The run is interrupted after a save within the episode, and resumes from it."""
     monkeypatch.setattr("merl.training.meters.Interval.LEAST", 0.01)
     monkeypatch.setattr("merl.training.trainer.LONG", 30)
     unruly.length = 10**9
@@ -358,22 +359,22 @@ def test_an_episode_without_end_is_saved_and_warned_of(
         return seen
 
     unruly.in_training = killed
-    # As if there were no time to save: what is on the disk is from before.
+    # Treat the failure of the environment like any other exception.
     monkeypatch.setattr("merl.training.trainer.EnvironmentFailed", ZeroDivisionError)
     assert train("--save-every", "0", "--eval.every", "0", "--steps", "100000") == 4
-    said = " ".join(capsys.readouterr().out.split())
-    assert "no episode has ended in 30 steps" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "no episode has ended in 30 steps" in printed
     unruly.in_training = None
     more = saved()[-1] + 10
     assert main(["resume", "run", "--steps", str(more)]) == 0
     assert saved()[-1] == more
-    assert "stopped in an episode" in " ".join(capsys.readouterr().out.split())
+    assert "stopped within an episode" in " ".join(capsys.readouterr().out.split())
 
 
-def test_evaluations_that_start_otherwise_each_time_are_warned_of(
+def test_evaluations_with_different_start_observations_give_a_warning(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """As with statistics that are taken in `step`: two resets at the start do not show them."""
+    """State that changes in `step`, e.g. running statistics, is not detected by resets alone."""
 
     def drift(env: Any, seen: Any) -> Any:
         env.drift = getattr(env, "drift", 0.0) + 1.0
@@ -382,6 +383,6 @@ def test_evaluations_that_start_otherwise_each_time_are_warned_of(
     unruly.in_evaluation = drift
     unruly.draw = lambda env: env.np_random.normal() + getattr(env, "drift", 0.0)
     assert train() == 0
-    said = capsys.readouterr()
-    assert " ".join(said.out.split()).count("do not start as those of the one before") == 1
-    assert said.err == ""
+    printed = capsys.readouterr()
+    assert " ".join(printed.out.split()).count("start differently from those of the previous") == 1
+    assert printed.err == ""

@@ -28,7 +28,7 @@ SCALE = {"random actions": 7.8, "scripted expert": 219.4}
 
 
 class Clock:
-    """Stands in for time.perf_counter."""
+    """Replacement of `time.perf_counter`, whose time a test sets."""
 
     def __init__(self) -> None:
         self.seconds = 100.0
@@ -39,7 +39,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """The view's clock, which stands still until a test moves it."""
+    """Replace the clock of the live view by one that only the test advances."""
     clock = Clock()
     monkeypatch.setattr(live_view.time, "perf_counter", clock)
     return clock
@@ -89,7 +89,7 @@ def text_of(console: Console) -> str:
 
 
 def drawn(view: LiveView) -> str:
-    """What the live table shows now, with single spaces."""
+    """Return the text of the live table, with single spaces."""
     with view.console.capture() as capture:
         view.console.print(view._draw())
     return flat(re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", capture.get()))
@@ -110,18 +110,18 @@ def watch(terminal: bool, width: int = 100, encoding: str = "utf-8") -> str:
     return text_of(console)
 
 
-def test_a_terminal_shows_progress_speed_and_what_is_learnt() -> None:
+def test_a_terminal_shows_progress_speed_and_results() -> None:
     for width in (60, 100):
         shown = flat(watch(terminal=True, width=width))
-        for said in ("250 of 1,000", "33 steps/s, 17 updates/s", "return 12.3, success 100%"):
-            assert said in shown
-        for said in ("Q 4.50", "at step 250", "warning: the disk is full", "saved at step 250"):
-            assert said in shown
-        assert shown.rstrip().endswith("\x1b[?25h")  # the cursor is back
+        for text in ("250 of 1,000", "33 steps/s, 17 updates/s", "return 12.3, success 100%"):
+            assert text in shown
+        for text in ("Q 4.50", "at step 250", "warning: the disk is full", "saved at step 250"):
+            assert text in shown
+        assert shown.rstrip().endswith("\x1b[?25h")  # shows the cursor again
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
-def test_elsewhere_there_are_plain_lines(encoding: str) -> None:
+def test_output_other_than_a_terminal_gets_plain_lines(encoding: str) -> None:
     shown = watch(terminal=False, width=60, encoding=encoding)
     assert shown.replace("\n", "").isprintable()
     lines = shown.splitlines()
@@ -135,11 +135,11 @@ def test_elsewhere_there_are_plain_lines(encoding: str) -> None:
     assert lines[4] == "warning: the disk is full"
 
 
-def test_a_terminal_that_knows_ascii_alone_is_shown_ascii_alone() -> None:
+def test_an_ascii_terminal_gets_only_ascii() -> None:
     watch(terminal=True, width=60, encoding="ascii")  # would raise UnicodeEncodeError
 
 
-def test_plain_lines_come_at_intervals_with_position_and_speed(clock: Clock) -> None:
+def test_plain_lines_are_printed_at_intervals_with_position_and_speed(clock: Clock) -> None:
     console = console_of(terminal=False)
     view = LiveView(console)
     view.on_start(trainer_of(new_run(minutes=10.0), 0))
@@ -160,7 +160,7 @@ def test_plain_lines_come_at_intervals_with_position_and_speed(clock: Clock) -> 
         (10.0, 10, 900.0, "100%"),  # the last evaluation
     ],
 )
-def test_the_bar_runs_to_the_limit_that_is_reached_first(
+def test_the_progress_bar_uses_the_limit_that_is_reached_first(
     minutes: float | None, step: int, seconds: float, percent: str, clock: Clock
 ) -> None:
     view = LiveView(console_of(terminal=False))
@@ -173,8 +173,8 @@ def test_the_bar_runs_to_the_limit_that_is_reached_first(
         assert f"{min(seconds, 600) / 60:02.0f}:00 of 10:00, or step {step}" in shown
 
 
-def test_the_time_left_is_of_the_pace_with_updates(clock: Clock) -> None:
-    """Steps without updates are much faster: an estimate from them would be far too short."""
+def test_the_time_left_uses_the_speed_with_updates(clock: Clock) -> None:
+    """Steps without updates are much faster, and the estimate would be far too short."""
     view = LiveView(console_of(terminal=False))
     view.on_start(trainer_of(new_run(), 0))
     clock.seconds += 10.0
@@ -182,7 +182,7 @@ def test_the_time_left_is_of_the_pace_with_updates(clock: Clock) -> None:
     assert "left" not in drawn(view)
     show_step(view, StepResult(101, 1), {})
     clock.seconds += 100.0
-    show_step(view, StepResult(201, 101), {})  # a step a second
+    show_step(view, StepResult(201, 101), {})  # one step per second
     assert "13:19 left" in drawn(view)
     clock.seconds += 800.0
     show_step(view, StepResult(1000, 900), {})
@@ -207,15 +207,15 @@ def test_before_the_first_evaluation_its_step_is_shown() -> None:
     view = LiveView(console_of(terminal=False))
     view.on_start(trainer_of(new_run(), 0))
     shown = drawn(view)
-    assert "evaluation the first one after step 250, or at the end" in shown
-    assert "compare with" not in shown  # nothing is known
+    assert "evaluation first one after step 250, or at the end" in shown
+    assert "compare with" not in shown  # no references are known
 
 
-def test_a_training_episode_without_success_counts_as_failed() -> None:
+def test_a_training_episode_without_a_success_report_counts_as_failed() -> None:
     view = LiveView(console_of(terminal=False))
     view.on_start(trainer_of(new_run(), 0))
-    silent = {name: value for name, value in METRICS.items() if "success" not in name}
-    for step, metrics in enumerate((METRICS, silent, silent, silent)):
+    without_report = {name: value for name, value in METRICS.items() if "success" not in name}
+    for step, metrics in enumerate((METRICS, *[without_report] * 3)):
         show_step(view, StepResult(step, 0), metrics)
     assert "success 25%" in drawn(view)
 
@@ -228,18 +228,18 @@ def test_a_resumed_run_shows_its_earlier_evaluations(tmp_path: Path) -> None:
     assert "evaluations ▁█ (scale: 0.0 to 5.0)" in drawn(view)
 
 
-def test_a_sparkline_averages_what_does_not_fit() -> None:
+def test_a_sparkline_averages_neighbours_if_there_are_too_many_values() -> None:
     assert sparkline([0.0, 3.5, 7.0], 0.0, 7.0) == "▁▅█"
     assert sparkline([1.0], 1.0, 1.0) == "▁"
     assert sparkline([0.0, 7.0] * 40, 0.0, 7.0, "_.-=+*%#") == "+" * 40
 
 
-def test_an_evaluation_in_one_line() -> None:
+def test_describe_puts_an_evaluation_in_one_line() -> None:
     line = describe(summarize(episodes()))
     assert line.startswith("return 1.5 [1.0, 2.0], success 50% [9%, 91%] at the end")
     assert line.endswith("(2 episodes)")
 
 
-def test_success_rates_that_are_equal_are_said_once() -> None:
+def test_equal_success_rates_are_printed_once() -> None:
     line = describe(summarize(episodes()[1:]))
     assert line == "return 1.0 [1.0, 1.0], success 0% [0%, 79%] at the end (1 episode)"

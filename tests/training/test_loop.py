@@ -128,7 +128,7 @@ def weights_without_stop(repeat: int) -> torch.Tensor:
     ],
 )  # fmt: skip
 def test_a_stop_waits_for_at_most_one_update(step: int, repeat: int) -> None:
-    """The resumed run makes the remaining updates, and ends with the weights of a run without stop."""
+    """The resumed run makes the remaining updates; it ends as a run without a stop does."""
     settings = dataclasses.replace(MANY, action_repeat=repeat)
     step += -step % repeat
     run = SmallRun(settings)

@@ -1,4 +1,4 @@
-"""A user's own environment through the command line, from training to a policy in Python."""
+"""A user's environment on the command line, from training to a policy in Python."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from gymnasium import spaces
 
 
 class Arm(gymnasium.Env):
-    """Two cameras of different sizes, joints, and a word that nobody can use; ends truly."""
+    """Two cameras of different sizes, joints and a key that agents cannot use; terminates."""
 
     metadata = {"render_modes": []}
 
@@ -49,7 +49,7 @@ class Arm(gymnasium.Env):
     def step(self, action):
         self.x[:2] = np.clip(self.x[:2] + 0.1 * action, -1, 1)
         self.steps += 1
-        over = np.bool_(self.steps == 12)  # as a comparison of arrays gives it
+        over = np.bool_(self.steps == 12)  # like the result of comparing arrays
         return self.see(), 1 - abs(self.x[0]), over, False, {"is_success": False}
 
     def see(self):
@@ -67,8 +67,8 @@ def rows(run: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
-    """As a user would: the file lies in the folder where `merl` is called."""
+def test_a_user_environment_with_two_cameras(tmp_path: Path) -> None:
+    """The module of the environment is in the folder where `merl` is called."""
     (tmp_path / "my_arm.py").write_text(TWO_CAMERAS)
 
     def call(*arguments: str, cwd: Path = tmp_path) -> str:
@@ -78,18 +78,18 @@ def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
         assert "Traceback" not in done.stderr
         return flat(done.stdout + done.stderr)
 
-    # d = 128: 42 for each of three senses
-    said_all = call("train", "my_arm:Arm", *SHORT, "--eval.references")
-    assert "'gear' is not used" in said_all
-    assert "there will be no videos" in said_all
-    assert "random actions" in said_all
+    # d = 128: 42 for each of the three modalities
+    printed = call("train", "my_arm:Arm", *SHORT, "--eval.references")
+    assert "'gear' is not used" in printed
+    assert "there will be no videos" in printed
+    assert "random actions" in printed
     run = tmp_path / "runs" / "my_arm-Arm-merl-smoke-s0"
     record = json.loads((run / "config.json").read_text())
     assert list(record["observation_space"]) == ["arm.joints", "front", "wrist"]
     assert record["observation_space"]["wrist"]["shape"] == [24, 26, 1]
     call("resume", str(run), "--steps", "360")
     assert rows(run)[-1]["step"] == "360"
-    (tmp_path / "elsewhere").mkdir()  # the run knows where the module lies
+    (tmp_path / "elsewhere").mkdir()  # the run records the folder of the module
     call("evaluate", str(run), "--episodes", "2", cwd=tmp_path / "elsewhere")
 
     call(
@@ -100,8 +100,8 @@ def test_two_cameras_of_ones_own(tmp_path: Path) -> None:
     assert list(record["observation_space"]) == ["front"]
 
 
-def test_held_actions_are_filmed_resumed_and_told_apart(tmp_path: Path) -> None:
-    """Noise that falls, actions held for three steps, a film of pictures as small as 32 pixels."""
+def test_a_run_with_action_repeat_makes_a_video_and_resumes(tmp_path: Path) -> None:
+    """The run has a noise schedule, an action repeat of 3, and camera images of 32 pixels."""
     run = tmp_path / "run"
     arguments = ["train", "merl.envs.dot:whole", "--agent", "drqv2", *SHORT, "--steps", "241"]
     assert main([*arguments, "--action-repeat", "3", "--run-dir", str(run)]) == 0
@@ -109,35 +109,35 @@ def test_held_actions_are_filmed_resumed_and_told_apart(tmp_path: Path) -> None:
     assert (config["action_repeat"], config["agent"]["noise_steps"]) == (3, 500)
     with av.open(str(next((run / "videos").iterdir()))) as video:
         assert video.streams.video[0].codec_context.width == 512
-        assert sum(1 for _ in video.decode(video=0)) == 7  # of 20 steps
+        assert sum(1 for _ in video.decode(video=0)) == 7  # 20 steps, three for each action
     last = rows(run)[-1]["step"]
     assert int(last) >= 241
-    assert main(["resume", str(run)]) == 0  # it is done, though it went beyond
+    assert main(["resume", str(run)]) == 0  # the run is done, with more steps than asked for
     assert rows(run)[-1]["step"] == last
     assert main(["resume", str(run), "--steps", "300"]) == 0
     assert int(rows(run)[-1]["step"]) >= 300
     assert main(["evaluate", str(run), "--renderer", "gl"]) == 2
 
 
-@pytest.mark.parametrize(("long", "told"), [(10, True), (30, False)])
-def test_who_waits_for_the_end_of_an_episode_is_told(
-    long: int,
-    told: bool,
+@pytest.mark.parametrize(("limit", "warns"), [(10, True), (30, False)])
+def test_a_long_episode_gives_a_warning(
+    limit: int,
+    warns: bool,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Those of the dot have 20 steps."""
-    monkeypatch.setattr("merl.training.trainer.LONG", long)
-    short = [*SHORT, "--agent", "proprio", "--run-dir", str(tmp_path / "r")]
-    assert main(["train", "merl.envs.dot:whole", *short]) == 0
+    """The episodes of the task have 20 steps."""
+    monkeypatch.setattr("merl.training.trainer.LONG", limit)
+    flags = [*SHORT, "--agent", "proprio", "--run-dir", str(tmp_path / "r")]
+    assert main(["train", "merl.envs.dot:whole", *flags]) == 0
     assert main(["resume", str(tmp_path / "r"), "--steps", "280"]) == 0
     out = flat(capsys.readouterr().out)
-    assert ("no episode has ended in" in out) == told
+    assert ("no episode has ended in" in out) == warns
 
 
 class Logged(DotEnv):
-    """Logs every call that would move a robot."""
+    """An environment that logs every call that would move a robot."""
 
     calls: ClassVar[list[str]] = []
 
@@ -155,7 +155,7 @@ class Logged(DotEnv):
 
 
 def moves(tmp_path: Path, *flags: str) -> tuple[int, int]:
-    """Train for 100 steps of ten to an episode, evaluate two episodes; returns resets and steps."""
+    """Train for 100 steps, ten per episode, evaluate two episodes; return resets and steps."""
     Logged.calls.clear()
     arguments = ["train", "test_own_env:Logged", "--agent", "proprio", *SHORT, "--steps", "100"]
     arguments += ["--eval.episodes", "2", "--agent.hidden-dim", "8", "--replay.batch-size", "8"]
@@ -163,23 +163,25 @@ def moves(tmp_path: Path, *flags: str) -> tuple[int, int]:
     return Logged.calls.count("reset"), Logged.calls.count("step")
 
 
-def test_nothing_but_training_and_evaluation_moves_a_users_robot(
+def test_only_training_and_evaluation_move_a_users_robot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    assert moves(tmp_path, "--eval.video", "none") == (10 + 2 + 3, 100 + 20)  # two are compared
-    said = " ".join(capsys.readouterr().out.split())
-    assert "100 steps of test_own_env:Logged on cpu (their duration is printed after" in said
-    assert "49 steps of test_own_env:Logged on cpu take about 0:00:0" in said
-    assert "nothing to compare with (--eval.references takes 20 episodes" in said
-    assert moves(tmp_path) == (10 + 2 + 3 + 1, 100 + 20)  # whether it can be filmed
+    assert moves(tmp_path, "--eval.video", "none") == (10 + 2 + 3, 100 + 20)  # 3: comparing resets
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "100 steps of test_own_env:Logged on cpu (their duration is printed after" in printed
+    assert "49 steps of test_own_env:Logged on cpu take about 0:00:0" in printed
+    assert "nothing to compare with (--eval.references takes 20 episodes" in printed
+    assert moves(tmp_path) == (10 + 2 + 3 + 1, 100 + 20)  # 1: does it render?
     assert moves(tmp_path, "--eval.video", "none", "--eval.references") == (15 + 40, 120 + 400)
     resets, steps = moves(tmp_path, "--eval.video", "none", "--measure")
     assert (resets > 15, steps) == (True, 120 + 75)
 
 
 @pytest.mark.parametrize("agent", ["ddpg", "sac", "merl_state"])
-def test_pendulum(agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_policy_in_python_equals_the_evaluation_on_pendulum(
+    agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "run"
     arguments = ["train", "Pendulum-v1", "--agent", agent, *SHORT, "--steps", "400"]
     assert main([*arguments, "--run-dir", str(run)]) == 0
@@ -189,11 +191,11 @@ def test_pendulum(agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["resume", str(run), "--steps", "600"]) == 0
     out = tmp_path / "evaluation.json"
     assert main(["evaluate", str(run), "--episodes", "2", "--json", str(out)]) == 0
-    told = [episode["return"] for episode in json.loads(out.read_text())["episodes"]]
+    reported = [episode["return"] for episode in json.loads(out.read_text())["episodes"]]
 
     policy = merl.load_policy(run)
     env = policy.make_env()
-    driven = []
+    returns = []
     for index in range(2):
         policy.reset()
         observation, _ = env.reset(seed=EVALUATION_SEED + index)
@@ -203,9 +205,9 @@ def test_pendulum(agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
             assert np.abs(action).max() <= 1
             observation, reward, terminated, truncated, _ = env.step(action)
             total, over = total + float(reward), terminated or truncated
-        driven.append(total)
+        returns.append(total)
     env.close()
-    assert driven == told
+    assert returns == reported
 
 
 FAILING = """
@@ -255,13 +257,13 @@ def make(render_mode=None):
 
 
 def failing(folder: Path, when: str) -> str:
-    """A module that fails then; its name, which no other test has."""
+    """Write a module whose environment fails at `when`, with a unique name; return the task."""
     name = f"arm_that_fails_{when}"
     (folder / f"{name}.py").write_text(f"WHEN = {when!r}\n{FAILING}")
     return f"{name}:make"
 
 
-def test_what_the_users_code_raises_is_told_and_the_run_saved(
+def test_an_exception_of_the_users_code_is_reported_and_the_run_saved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -280,7 +282,7 @@ def test_what_the_users_code_raises_is_told_and_the_run_saved(
     assert rows(Path("run"))[-1]["step"] == "240"
 
 
-def test_a_film_that_fails_stops_nothing(
+def test_a_failing_video_does_not_stop_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -296,17 +298,17 @@ def test_a_nan_in_an_evaluation_stops_the_run(
     assert "'joints' is nan at index 0 at step" in capsys.readouterr().err
 
 
-def test_an_arm_that_has_become_another_is_refused(
+def test_resume_and_evaluate_refuse_an_environment_with_other_spaces(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     task = failing(tmp_path, "never")
-    short = [*SHORT, "--eval.video", "none"]
-    assert main(["train", task, *short, "--run-dir", "run"]) == 0
+    flags = [*SHORT, "--eval.video", "none"]
+    assert main(["train", task, *flags, "--run-dir", "run"]) == 0
     assert "there is nothing to compare with" in flat(capsys.readouterr().out)
     module = Path("arm_that_fails_never.py")
-    whole = module.read_text()
-    for change, says in {
+    source = module.read_text()
+    for change, message in {
         ("LIMIT = 1.5", "LIMIT = 9.5"): "bounds was low [-1.5, -1.5], high [1.5, 1.5] and is low",
         ("(4,)", "(5,)"): "'joints' was float32 (4,) and is float32 (5,)",
         (
@@ -315,23 +317,23 @@ def test_an_arm_that_has_become_another_is_refused(
         ): "'more' was missing",
         ("(2,), np", "(3,), np"): "action was float32 (2,) and is float32 (3,)",
     }.items():
-        module.write_text(whole.replace(*change))
+        module.write_text(source.replace(*change))
         for line in (["resume", "run", "--steps", "300"], ["evaluate", "run"]):
             sys.modules.pop("arm_that_fails_never")
             assert main(line) == 2, (change, line)
             error = capsys.readouterr().err.strip()
-            assert says in error.splitlines()[-1]
-    # a module of the same name elsewhere is not taken for the run's
-    module.write_text(whole)
+            assert message in error.splitlines()[-1]
+    # A module of the same name in another working folder is not used.
+    module.write_text(source)
     (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / module).write_text(whole.replace("(4,)", "(7,)"))
+    (tmp_path / "elsewhere" / module).write_text(source.replace("(4,)", "(7,)"))
     monkeypatch.chdir(tmp_path / "elsewhere")
     sys.modules.pop("arm_that_fails_never")
     assert main(["evaluate", "../run"]) == 0
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["CartPole-v1"], "actions are Discrete(2)"),
         (["Pendulum-v1", "--agent", "drqv2"], "or use --agent merl_state, ddpg or sac"),
@@ -339,8 +341,8 @@ def test_an_arm_that_has_become_another_is_refused(
             ["merl.envs.dot:whole", "--agent", "sac", "--agent.vectors", "state"],
             "agent.vectors names 'state', but the environment gives ['joints']",
         ),
-        (["reach_duplo", "--env.image-layout", "chw"], "for an environment of your own"),
-        (["reach_duplo", "--env.allow-wide-actions"], "for an environment of your own"),
+        (["reach_duplo", "--env.image-layout", "chw"], "for your own environment"),
+        (["reach_duplo", "--env.allow-wide-actions"], "for your own environment"),
         (["Pendulum-v1", "--agent", "ddgp"], "did you mean 'ddpg'"),
         (["Pendulum-v1", "--agent", "ddpg", "--renderer", "gl"], "--renderer is for merl's own"),
         (["Pendulm-v1", "--agent", "ddpg"], "did you mean 'Pendulum-v1'"),
@@ -367,9 +369,9 @@ def test_an_arm_that_has_become_another_is_refused(
         (["merl.envs.dot:whole", "--agent", "ddpg", "--agent.vectors", "x"], "or add 'x' to the"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(
+def test_bad_input_is_reported_in_one_line_and_leaves_no_files(
     arguments: list[str],
-    says: str,
+    message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -377,7 +379,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     monkeypatch.chdir(tmp_path)
     assert main(["train", *arguments, "--preset", "smoke"]) == 2
     error = capsys.readouterr().err.strip()
-    assert says in error
+    assert message in error
     assert len(error.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 
@@ -386,5 +388,5 @@ def test_the_newest_version_of_an_outdated_environment_is_named(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["train", "Ant-v3", "--agent", "sac", "--preset", "smoke"]) == 2
-    last = capsys.readouterr().err.strip().splitlines()[-1]  # Gymnasium warns before
+    last = capsys.readouterr().err.strip().splitlines()[-1]  # after warnings of Gymnasium
     assert last.endswith("use its newest version, Ant-v5")

@@ -45,13 +45,13 @@ def vector(n: int) -> spaces.Box:
 
 
 class Toy(gymnasium.Env[Any, Any]):
-    """Episodes of five steps; `info` of each is what `tell` says."""
+    """An environment with episodes of five steps; `info_at` returns the info of a step."""
 
     observation_space: spaces.Space[Any] = vector(3)
     action_space = spaces.Box(-1, 1, (2,), np.float32)
 
-    def __init__(self, tell: Callable[[int, int], dict[str, Any]] = lambda episode, step: {}):
-        self.tell, self.episode, self.taken = tell, -1, 0
+    def __init__(self, info_at: Callable[[int, int], dict[str, Any]] = lambda episode, step: {}):
+        self.info_at, self.episode, self.taken = info_at, -1, 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
@@ -61,16 +61,16 @@ class Toy(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> Any:
         self.taken += 1
-        info = self.tell(self.episode, self.taken)
+        info = self.info_at(self.episode, self.taken)
         over = self.taken == LENGTH
         return self.observation_space.sample(), 0.0, False, over, info
 
 
-# -- which keys are used --------------------------------------------------------------------------
+# -- observation keys -----------------------------------------------------------------------------
 
 
 class Arm(Toy):
-    """A camera, joints, a vector called `state`, and a gear that nobody can use."""
+    """Two cameras, joints, a vector called `state`, and `gear`, which agents cannot use."""
 
     observation_space = spaces.Dict(
         {
@@ -84,7 +84,7 @@ class Arm(Toy):
 
 
 class Plain(Toy):
-    """A plain box."""
+    """The observation is a plain box."""
 
 
 def config_of(agent: str, task: str = f"{here}:Arm", **values: Any) -> TrainConfig:
@@ -106,13 +106,13 @@ def config_of(agent: str, task: str = f"{here}:Arm", **values: Any) -> TrainConf
         ("merl", {"privileged": ("state",)}, ["mask", "pixels"], ["joints"], ["state"]),
     ],
 )
-def test_every_modality_is_used_and_the_rest_is_said(
+def test_every_modality_is_used_and_unused_keys_are_reported(
     agent: str, values: dict[str, Any], images: list[str], vectors: list[str], critic: list[str]
 ) -> None:
     config = config_of(agent, **values)
     env = make_run_env(config)
-    assert set(run_spaces(config, env)[0]) == {*images, *vectors, *critic}  # type: ignore[call-overload]
-    words = {
+    assert run_spaces(config, env)[0].keys() == {*images, *vectors, *critic}
+    described = {
         "pixels": "pixels (24 x 24 x 3, from 0 to 255)",
         "mask": "mask (24 x 26 x 1, from 0 to 1)",
         "joints": "joints (4 numbers)",
@@ -124,15 +124,15 @@ def test_every_modality_is_used_and_the_rest_is_said(
         ("vectors used: ", vectors),
         ("vectors used by the critic alone: ", critic),
     ):
-        expected = [start + ", ".join(words[key] for key in keys)] if keys else []
+        expected = [start + ", ".join(described[key] for key in keys)] if keys else []
         assert [line for line in lines if line.startswith(start)] == expected
     left_out = lines[-1]
     assert "'gear' is not used: Discrete(3): encode it as one-hot" in left_out
-    for key in words:
+    for key in described:
         assert (f"{key!r} is not used: " in left_out) == (key not in [*images, *vectors, *critic])
 
 
-def test_the_reason_names_the_option_that_works() -> None:
+def test_the_reason_for_an_unused_key_names_the_option() -> None:
     config = config_of("drqv2")
     left_out = key_lines(config, make_run_env(config))[-1]
     assert (
@@ -145,7 +145,7 @@ def test_the_reason_names_the_option_that_works() -> None:
     )
 
 
-def test_a_plain_box_needs_no_name() -> None:
+def test_a_plain_box_of_numbers_is_the_key_state() -> None:
     for agent in ("merl", "ddpg"):
         config = config_of(agent, f"{here}:Plain")
         env = make_run_env(config)
@@ -154,8 +154,8 @@ def test_a_plain_box_needs_no_name() -> None:
 
 def test_merls_own_tasks_use_the_state_only_if_it_is_named() -> None:
     config = compose("smoke", "reach_duplo")
-    seen = dataclasses.replace(config.env, observations=("image", "proprio", "state"))
-    config = dataclasses.replace(config, env=seen)
+    env_config = dataclasses.replace(config.env, observations=("image", "proprio", "state"))
+    config = dataclasses.replace(config, env=env_config)
     env = make_run_env(config)
     lines = key_lines(config, env)
     env.close()
@@ -166,17 +166,17 @@ def test_merls_own_tasks_use_the_state_only_if_it_is_named() -> None:
     assert AGENTS["ddpg"].vectors == compose("smoke", "reach_duplo", "ddpg").agent.vectors
 
 
-def test_a_run_says_its_keys_and_resumes_with_them(
+def test_a_run_prints_its_keys_and_resumes_with_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also a run by an earlier merl, which left `state` out, and knew no `user_env`."""
+    """This includes a run of an earlier version, which recorded neither `user_env` nor the keys."""
     run = tmp_path / "run"
-    narrow = ["--agent.vectors", "joints", "--agent.images", "mask"]
+    keys = ["--agent.vectors", "joints", "--agent.images", "mask"]
     line = ["train", f"{here}:Arm", *SMALL, "--run-dir", str(run)]
-    assert main([*line, *narrow]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "images used: mask (24 x 26 x 1, from 0 to 1)" in said
-    assert "'pixels' is not used: --agent.images names others" in said
+    assert main([*line, *keys]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "images used: mask (24 x 26 x 1, from 0 to 1)" in printed
+    assert "'pixels' is not used: --agent.images names others" in printed
     file = run / "config.json"
     record = json.loads(file.read_text())
     assert record["observation_space"]["mask"]["bounds"] == [0, 1]
@@ -194,7 +194,7 @@ def test_a_run_says_its_keys_and_resumes_with_them(
 # -- the policy in Python -------------------------------------------------------------------------
 
 
-def test_a_policy_takes_tensors_and_names_what_it_cannot_take(tmp_path: Path) -> None:
+def test_a_policy_accepts_tensors_and_rejects_invalid_observations(tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert main(["train", f"{here}:Arm", *SMALL, "--run-dir", str(run)]) == 0
     policy = merl.load_policy(run)
@@ -205,7 +205,7 @@ def test_a_policy_takes_tensors_and_names_what_it_cannot_take(tmp_path: Path) ->
     tensors = {key: torch.from_numpy(value) for key, value in observation.items()}
     tensors["joints"] = tensors["joints"].double().requires_grad_()
     np.testing.assert_array_equal(policy(tensors), action)  # type: ignore[arg-type]
-    for key, value, says in (
+    for key, value, message in (
         ("joints", [[1.0], [1.0, 2.0]], "cannot be converted"),
         ("joints", None, "'joints' contains a value that is not a number: None"),
         ("joints", np.zeros(3), r"'joints' has shape \(3,\)"),
@@ -213,15 +213,15 @@ def test_a_policy_takes_tensors_and_names_what_it_cannot_take(tmp_path: Path) ->
         ("pixels", observation["pixels"] / 255, "'pixels' has dtype float64"),
         ("mask", observation["mask"] + 1, "but its space has 0 to 1"),
     ):
-        with pytest.raises(MerlError, match=says) as caught:
+        with pytest.raises(MerlError, match=message) as caught:
             policy(observation | {key: value})
         assert len(str(caught.value).splitlines()) == 1
-    with pytest.raises(MerlError, match="is of ndarray: a dict with"):
+    with pytest.raises(MerlError, match="the observation is a ndarray: give a dict with"):
         policy(np.zeros(3))  # type: ignore[arg-type]
 
 
 class Ragged(Toy):
-    """Gives a ragged list late in its life."""
+    """An environment that returns a ragged list in its third episode."""
 
     def step(self, action: Any) -> Any:
         observation, *others = super().step(action)
@@ -243,29 +243,30 @@ def test_an_observation_that_cannot_be_converted_leaves_a_saved_run(
 # -- success --------------------------------------------------------------------------------------
 
 
-def reported_by_those_that_succeed(episode: int, step: int) -> dict[str, Any]:
+def success_in_every_fifth_episode(episode: int, step: int) -> dict[str, Any]:
+    """Report success at the end of every fifth episode, and nothing otherwise."""
     return {"is_success": True} if episode % 5 == 0 and step == LENGTH else {}
 
 
-def still(_: Any) -> Any:
+def zero_action(_: Any) -> Any:
     return np.zeros(2, np.float32)
 
 
-def test_success_told_by_the_successful_alone_is_a_share_of_all_episodes() -> None:
-    result = evaluate(still, adapt(Toy(reported_by_those_that_succeed)), 20)
+def test_episodes_without_a_success_report_count_as_failed() -> None:
+    result = evaluate(zero_action, adapt(Toy(success_in_every_fifth_episode)), 20)
     for interval in (result.success_end, result.success_any, result.success_share):
         assert interval is not None
         assert interval.mean == pytest.approx(4 / 20)
-    silent = evaluate(still, adapt(Toy()), 4)
-    assert silent.success_end is None
-    known = evaluate(still, adapt(Toy()), 4, reports_success=True)
+    without_report = evaluate(zero_action, adapt(Toy()), 4)
+    assert without_report.success_end is None
+    known = evaluate(zero_action, adapt(Toy()), 4, reports_success=True)
     assert known.success_end is not None
     assert known.success_end.mean == 0
     assert known.metrics()["success_share"] == 0
 
 
 class Rare(Toy):
-    """Reports success in the second episode of the first instance, and never again."""
+    """An environment that reports success only in the second episode of its first instance."""
 
     instances = itertools.count()
 
@@ -276,7 +277,7 @@ class Rare(Toy):
         )
 
 
-def test_once_success_is_reported_silence_is_failure_also_after_resuming(
+def test_after_a_success_report_no_report_means_failure_also_after_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("merl.training.timing._time_step", lambda env: 0.001)
@@ -286,7 +287,7 @@ def test_once_success_is_reported_silence_is_failure_also_after_resuming(
     assert main(["resume", str(run), "--steps", "60"]) == 0
     metrics = read_metrics(run)
     ends = metrics["train/success_end"][~np.isnan(metrics["train/return"])]
-    assert np.isnan(ends[0])  # not yet known
+    assert np.isnan(ends[0])  # success was not reported yet
     assert ends[1:].tolist() == [1.0] + [0.0] * 10
     evaluated = ~np.isnan(metrics["eval/return"])
     assert metrics["eval/success_end"][evaluated].tolist() == [0.0, 0.0, 0.0]
@@ -296,17 +297,17 @@ def test_once_success_is_reported_silence_is_failure_also_after_resuming(
     assert [episode["success_any"] for episode in episodes] == [0.0, 0.0]
 
 
-def test_a_success_that_is_neither_ends_the_run_in_one_line() -> None:
+def test_an_invalid_success_value_is_reported() -> None:
     env = adapt(Toy(lambda episode, step: {"is_success": {"other": True}}))
     with pytest.raises(EnvironmentFailed, match=r"info\[\"is_success\"\] is \{'other': True\}"):
-        evaluate(still, env, 1)
+        evaluate(zero_action, env, 1)
 
 
 # -- instances that differ ------------------------------------------------------------------------
 
 
 class Changing(Toy):
-    """Its second instance is another one, in what `change` says."""
+    """An environment whose second instance differs in `change`."""
 
     change = ""
     instances = itertools.count()
@@ -327,7 +328,7 @@ class Changing(Toy):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ("shape", r"'state' is a float32 box \(3,\) .* and a float32 box \(4,\)"),
         ("key", "'joints' is missing and a float32 box"),
@@ -337,7 +338,7 @@ class Changing(Toy):
     ],
 )
 def test_instances_that_differ_are_refused_at_the_start(
-    change: str, says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    change: str, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(Changing, "change", change)
     monkeypatch.setattr(Changing, "instances", itertools.count())
@@ -345,7 +346,7 @@ def test_instances_that_differ_are_refused_at_the_start(
         compose("smoke", f"{here}:Changing"), run_dir=tmp_path / "run", device="cpu", threads=1
     )
     with (
-        pytest.raises(MerlError, match=f"two instances of the environment differ.*{says}") as error,
+        pytest.raises(MerlError, match=f"two instances of the environment.*{message}") as error,
         Setup.prepare(config, new=True),
     ):
         pass
@@ -365,7 +366,7 @@ def test_a_worker_compares_its_instance_with_the_first(monkeypatch: pytest.Monke
         worker.reset()
 
 
-def test_how_spaces_are_read_is_part_of_the_config() -> None:
+def test_allow_wide_actions_is_part_of_the_config() -> None:
     config = compose("smoke", f"{here}:Wide")
     with pytest.raises(MerlError, match=r"use --env.allow-wide-actions"):
         make_run_env(config)
@@ -374,14 +375,14 @@ def test_how_spaces_are_read_is_part_of_the_config() -> None:
 
 
 class Wide(Toy):
-    """Actions whose bounds are placeholders."""
+    """An environment whose action bounds are placeholders."""
 
     action_space = spaces.Box(-1e30, 1e30, (2,), np.float32)
 
 
-def test_pixel_bounds_are_recorded_and_others_are_refused() -> None:
-    mask, picture = (spaces.Box(0, high, (24, 24, 1), np.uint8) for high in (1, 255))
+def test_bounds_are_recorded_and_are_described_only_for_pixels() -> None:
+    mask, image = (spaces.Box(0, high, (24, 24, 1), np.uint8) for high in (1, 255))
     assert box(describe(mask)) == mask
     assert told(describe(mask)) == "uint8 (24, 24, 1) from 0 to 1"
-    assert told(describe(mask)) != told(describe(picture))
+    assert told(describe(mask)) != told(describe(image))
     assert told(describe(vector(3))) == told(describe(spaces.Box(-1, 1, (3,), np.float32)))

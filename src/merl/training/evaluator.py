@@ -21,7 +21,7 @@ that, it is skipped."""
 
 
 class _Interrupted(Exception):  # noqa: N818 (not an error)
-    """A signal arrived, and the evaluation ends early."""
+    """An exception that ends an evaluation early after a signal."""
 
 
 class Evaluations:

@@ -85,7 +85,7 @@ class Interval:
     """
 
     LEAST = 5.0
-    """Shortest interval, in seconds, that counts for saves within an episode."""
+    """Lower bound, in seconds, of the interval that is used for saves within an episode."""
 
     def __init__(self, seconds: float, now: Callable[[], float] = time.perf_counter) -> None:
         self._seconds, self._now = seconds, now

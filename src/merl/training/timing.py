@@ -30,7 +30,7 @@ from merl.training.loop import Update
 from merl.training.updating import Recorded
 
 REPEATS = 3
-"""Number of measurements, of which the median counts."""
+"""Number of measurements; their median is the result."""
 REPEATS_ON_GPU = 30
 """Number of measurements of an update on a GPU, where it takes a few milliseconds."""
 MEASURED_STEPS = 25

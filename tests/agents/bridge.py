@@ -65,7 +65,7 @@ class Case:
             sigma=c.noise(self.step),
             clip=c.noise_clip,
             tau=c.tau,
-            learning_rate=c.learning_rate,
+            learning_rate=c.step_size(self.step),
             averaged=(*fusion, "phi_1", "phi_2"),
             bins=c.critic_bins if c.critic_loss == "hl_gauss" else 0,
             low=c.critic_low,

@@ -15,7 +15,7 @@ from torch import Tensor
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
-from merl.agents.sac import SACConfig
+from merl.agents.sac import SAC, SACConfig
 from merl.runs.checkpoint import load_agent, load_networks, save
 
 SMALL = {"hidden_dim": 16, "precision": "fp32"}
@@ -73,6 +73,28 @@ def test_state_without_a_count_of_updates_can_be_loaded() -> None:
     agent = case.agent(seed=9)
     agent.load_state_dict(state)
     assert agent.updates == 0
+
+
+# -- a step size that decays ---------------------------------------------------------------------
+
+
+@AGENTS
+def test_the_step_size_of_every_optimizer_decays_with_the_steps(config: AgentConfig) -> None:
+    values = {"learning_rate": 1e-3, "learning_rate_end": 1e-4, "learning_rate_steps": 100}
+    case = case_of(config, **values)
+    agent, resumed = case.agent(), case.agent()
+    for step, rate in ((0, 1e-3), (50, 5.5e-4), (100, 1e-4), (1000, 1e-4)):
+        agent.step = step
+        train(agent, case, range(1))
+        resumed.load_state_dict(through_a_file(agent.state_dict()))
+        resumed.step = step
+        train(resumed, case, range(1))
+        for each in (agent, resumed):
+            optimizers = [each.critic_optimizer, each.actor_optimizer]
+            if isinstance(each, SAC):
+                optimizers.append(each.alpha_optimizer)
+            for optimizer in optimizers:
+                assert [group["lr"] for group in optimizer.param_groups] == [pytest.approx(rate)]
 
 
 # -- an average of the actor ---------------------------------------------------------------------

@@ -109,6 +109,8 @@ def test_config_that_does_not_fit_the_space_is_rejected(
     [
         ("learning_rate", 0.0),
         ("learning_rate", float("nan")),
+        ("learning_rate_end", 0.0),
+        ("learning_rate_steps", 0),
         ("actor_average", 0.0),
         ("tau", 0.0),
         ("tau", 1.01),

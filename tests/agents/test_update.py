@@ -69,6 +69,11 @@ CASES = [
         step=400,
     ),
     Case(
+        "decaying-step-size",
+        replace(SMALL, learning_rate=1e-3, learning_rate_end=1e-4, learning_rate_steps=1000),
+        step=400,
+    ),
+    Case(
         "hl-gauss",
         replace(SMALL, critic_loss="hl_gauss", critic_bins=21, critic_low=1.0, critic_high=2.5),
     ),

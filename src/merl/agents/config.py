@@ -35,6 +35,11 @@ class AgentConfig:
     critic)."""
     learning_rate: float = 1e-4
     """Step size of Adam, for every network."""
+    learning_rate_end: float | None = None
+    """Step size at the end of a linear decay over `learning_rate_steps`; if not set, it is
+    constant."""
+    learning_rate_steps: int = 500_000
+    """Environment steps of the decay of the step size."""
     critic_loss: CriticLoss = "mse"
     """Loss of the critic: the mean squared error (mse), or the cross-entropy of a histogram of
     returns (hl_gauss; Farebrother et al. 2024)."""
@@ -104,8 +109,9 @@ class AgentConfig:
     which tries it once on a GPU in a long run, and keeps it if it is faster."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.learning_rate < math.inf:
-            raise MerlError(f"agent.learning-rate must be above 0, not {self.learning_rate}")
+        for name, value in self._given("learning_rate", "learning_rate_end"):
+            if not 0 < value < math.inf:
+                raise MerlError(f"agent.{_flag(name)} must be above 0, not {value}")
         for name, choice, choices in (
             ("precision", self.precision, get_args(Precision)),
             ("target", self.target, get_args(Target)),
@@ -127,11 +133,11 @@ class AgentConfig:
             )
         if not self.noise_clip >= 0:
             raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
-        least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1, "noise_steps": 1}
-        least["critic_bins"] = HLGauss.FEWEST
+        least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1}
+        least |= {"noise_steps": 1, "learning_rate_steps": 1, "critic_bins": HLGauss.FEWEST}
         least |= {"actor_every": 1, "latent_dim": 0, "shift_pad": 0, "vector_encoder_dim": 0}
         for name, bound in least.items():
-            most = WIDEST if name != "noise_steps" else 10**12
+            most = 10**12 if name.endswith("_steps") else WIDEST
             if not bound <= getattr(self, name) <= most:
                 raise MerlError(
                     f"agent.{_flag(name)} must be at least {bound} and at most {most}, "
@@ -172,10 +178,17 @@ class AgentConfig:
 
     def noise(self, step: int) -> float:
         """Return the exploration noise's standard deviation after `step` environment steps."""
-        if self.noise_std_end is None:
-            return self.noise_std
-        share = min(step / self.noise_steps, 1.0)
-        return self.noise_std + share * (self.noise_std_end - self.noise_std)
+        return _decayed(self.noise_std, self.noise_std_end, step / self.noise_steps)
+
+    def step_size(self, step: int) -> float:
+        """Return Adam's step size after `step` environment steps."""
+        share = step / self.learning_rate_steps
+        return _decayed(self.learning_rate, self.learning_rate_end, share)
+
+
+def _decayed(start: float, end: float | None, share: float) -> float:
+    """Return a value after this share of a linear decay; constant without an end."""
+    return start if end is None else start + min(share, 1.0) * (end - start)
 
 
 def _flag(name: str) -> str:

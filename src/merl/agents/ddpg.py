@@ -23,7 +23,7 @@ from merl.agents.compiling import compile_parts
 from merl.agents.config import AgentConfig
 from merl.agents.gradients import clamp_straight_through, frozen
 from merl.agents.networks import Networks
-from merl.agents.optimizers import adam, load_optimizer, step_optimizer
+from merl.agents.optimizers import adam, load_optimizer, set_step_size, step_optimizer
 from merl.agents.update_noise import UpdateNoise
 from merl.core import Batch, FrameTransforms
 from merl.networks.augmentation import RandomShift, draw_shifts
@@ -82,6 +82,7 @@ class DDPG:
         parts = networks.encoders, networks.critic_fusion, networks.critic
         self.critic_parameters = [parameter for part in parts for parameter in part.parameters()]
         self.actor_parameters = [*self._actors_fusion(), *networks.actor.parameters()]
+        self._optimizers: list[torch.optim.Adam] = []
         self.critic_optimizer = self._adam(self.critic_parameters)
         self.actor_optimizer = self._adam(self.actor_parameters)
         if config.torch_compile == "yes":
@@ -137,6 +138,8 @@ class DDPG:
     @with_torch_settings
     def learn(self, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
         """Augment and encode the batch; update the critic, the actor if due, and the target."""
+        if self.sigma is None:  # else `Recorded` sets step size and noise on the device
+            self.set_step_size()
         encoders = self.networks.encoders
         encoders.observe(batch.observation)
         with self._arithmetic():
@@ -253,6 +256,11 @@ class DDPG:
         sigma = self.config.noise(self.step) if self.sigma is None else self.sigma
         return noise.mul_(sigma).clamp_(-clip, clip)
 
+    def set_step_size(self) -> None:
+        """Set the step size for `step`, where it decays."""
+        for optimizer in self._optimizers:
+            set_step_size(optimizer, self.config.step_size(self.step))
+
     # Saving ---------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
@@ -323,5 +331,12 @@ class DDPG:
 
     def _adam(self, parameters: Sequence[Tensor]) -> torch.optim.Adam:
         """Make Adam for these parameters, with the config's step size."""
-        on_gpu = self.device.type == "cuda"  # CUDA graphs read the step from the device
-        return adam(parameters, self.config.learning_rate, capturable=on_gpu)
+        on_gpu = self.device.type == "cuda"  # CUDA graphs read step and step size from the device
+        decays = self.config.learning_rate_end is not None
+        rate: float | Tensor = self.config.learning_rate
+        if on_gpu and decays:
+            rate = torch.tensor(rate, device=self.device)
+        optimizer = adam(parameters, rate, capturable=on_gpu)
+        if decays:
+            self._optimizers.append(optimizer)
+        return optimizer

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 
-def adam(parameters: Sequence[Tensor], rate: float, *, capturable: bool) -> torch.optim.Adam:
+def adam(
+    parameters: Sequence[Tensor], rate: float | Tensor, *, capturable: bool
+) -> torch.optim.Adam:
     """Make Adam for these parameters.
 
     Args:
         parameters: parameters to train.
-        rate: step size.
+        rate: step size; a tensor on the device if it will change while a CUDA graph contains it.
         capturable: whether a CUDA graph can contain its step.
     """
     return torch.optim.Adam(parameters, lr=rate, fused=True, capturable=capturable)
@@ -29,16 +31,25 @@ def step_optimizer(
     optimizer.step()
 
 
+def set_step_size(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Set the step size."""
+    for group in optimizer.param_groups:
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
+
+
 def load_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
     """Restore Adam's moments, as copies in the memory order of the weights.
 
     The fused step reads raw memory: moments in another order would be paired with the wrong
-    weights. `capturable` is kept as set for the current device, not as saved.
+    weights. `capturable` and the step size are kept as set for the current device, not as saved.
     """
-    capturable = [group["capturable"] for group in optimizer.param_groups]
+    own = [(group["capturable"], group["lr"]) for group in optimizer.param_groups]
     optimizer.load_state_dict(dict(saved))
-    for group, own in zip(optimizer.param_groups, capturable, strict=True):
-        group["capturable"] = own
+    for group, (capturable, rate) in zip(optimizer.param_groups, own, strict=True):
+        group["capturable"], group["lr"] = capturable, rate
     for parameter, moments in optimizer.state.items():
         for name in ("exp_avg", "exp_avg_sq"):
             moments[name] = torch.empty_like(parameter).copy_(moments[name])

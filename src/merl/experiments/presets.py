@@ -65,6 +65,8 @@ PRESETS: dict[str, Preset] = {
             "shift_pad": 1,
             "hidden_dim": 256,
             "actor_average": 0.001,
+            "learning_rate_end": 1e-4,
+            "learning_rate_steps": 400_000,
         },
         own_env={
             "steps": 150_000,

@@ -125,6 +125,7 @@ class Recorded:
     def __call__(self) -> dict[str, Tensor]:
         """Make one update and return its metrics, scalars on the device."""
         self._sigma.fill_(self._agent.config.noise(self._agent.step))
+        self._agent.set_step_size()
         kind, updates = self._agent.actor_is_due, self._agent.updates
         self._made[kind] += 1
         if not self._on_gpu:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from merl.api import evaluate, train
     from merl.config import TrainConfig
     from merl.envs import make_env
-    from merl.evaluation.evaluation import load_policy
+    from merl.evaluation.policy import load_policy
     from merl.training.callbacks import Callback
     from merl.training.trainer import Trainer
 
@@ -51,7 +51,7 @@ _PUBLIC = {
     "TrainConfig": "merl.config",
     "Trainer": "merl.training.trainer",
     "evaluate": "merl.api",
-    "load_policy": "merl.evaluation.evaluation",
+    "load_policy": "merl.evaluation.policy",
     "make_env": "merl.envs",
     "train": "merl.api",
 }

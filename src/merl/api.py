@@ -13,7 +13,8 @@ from typing import Any
 
 from merl.config import Setting, TrainConfig, override
 from merl.envs.config import RendererName
-from merl.evaluation.evaluation import Evaluation, load_policy
+from merl.evaluation.evaluation import Evaluation
+from merl.evaluation.policy import load_policy
 from merl.experiments.presets import compose, default_preset
 from merl.training.callbacks import Callback
 from merl.training.trainer import Outcome, Trainer

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from merl.acting.environments import InProcessEnvs, _Worker
+from merl.acting.environments import InProcessEnvs
 from merl.acting.generators import (
     global_state,
     kept_generators,
@@ -18,6 +18,7 @@ from merl.acting.generators import (
     set_global_state,
 )
 from merl.acting.run_env import environment_state, set_environment_state
+from merl.acting.workers import _Worker
 from toy import DotEnv
 
 MODULE_GENERATOR = np.random.default_rng(1)

@@ -40,7 +40,7 @@ SMALL_VIDEO = ["--render-size", "64"]
 def small_videos() -> Iterator[None]:
     """Allow rendering below the minimum size of a video; the video enlarges the frames."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("merl.training.setup", "merl.evaluation.evaluation"):
+        for module in ("merl.training.setup", "merl.evaluation.policy"):
             patch.setattr(f"{module}.MIN_SIDE", 16)
         yield
 
@@ -174,7 +174,7 @@ def test_evaluating_with_gl_uses_one_sample(run: Path, monkeypatch: pytest.Monke
     env_config = dataclasses.replace(policy.config.env, samples=2)
     policy.config = dataclasses.replace(policy.config, env=env_config)
     monkeypatch.setattr(
-        "merl.evaluation.evaluation.make_run_env", lambda config, **changes: made.append(changes)
+        "merl.evaluation.policy.make_run_env", lambda config, **changes: made.append(changes)
     )
     with pytest.warns(UserWarning, match="trained with renderer 'raster'"):
         policy.make_env(renderer="gl")

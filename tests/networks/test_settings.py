@@ -19,7 +19,7 @@ from merl.agents.merl import MERLConfig
 from merl.cli import main
 from merl.config import TrainConfig
 from merl.core import MerlError, Transition
-from merl.evaluation.evaluation import Policy
+from merl.evaluation.policy import Policy
 from merl.networks.settings import torch_settings
 from merl.replay import ReplayBuffer, ReplayConfig
 from merl.runs import checkpoint

@@ -16,8 +16,8 @@ import torch
 from gymnasium import spaces
 
 import merl
-from merl.acting.environments import _Maker
 from merl.acting.run_env import EnvSpaces, key_lines, make_run_env, run_spaces
+from merl.acting.workers import _Maker
 from merl.agents import AGENTS
 from merl.cli import main
 from merl.config import TrainConfig

@@ -16,9 +16,10 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from merl.acting.environments import Environments, InProcessEnvs, WorkerEnvs
+from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack
 from merl.acting.run_env import make_run_env, run_spaces
+from merl.acting.workers import WorkerEnvs
 from merl.agents import make_agent
 from merl.bench.measuring import Side, circumstances, shown, spread
 from merl.config import TrainConfig

@@ -8,6 +8,7 @@ from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
 
+from rich.console import Console
 from rich.filesize import decimal
 
 from merl.acting.run_env import key_lines
@@ -111,18 +112,13 @@ def tell_trusted(run: Run) -> None:
 def _train(
     config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint | None] | None = None
 ) -> int:
+    """Train, print the result, and return the exit code."""
     console = make_console()
-    with ExitStack() as stack:
-        try:
-            view = DurationView(console, _scale(config))
-            with console.status("building the scene and timing this machine", spinner="line"):
-                trainer = stack.enter_context(Trainer(config, [view], resumed=resumed))
-            done = resumed[1].step if resumed and resumed[1] else 0
-            console.print(_outlook(trainer.setup, what, done), highlight=False)
-            outcome = trainer.fit()
-        except KeyboardInterrupt:  # during training, `Interrupt` defers signals
-            console.print("stopped before training began: nothing was written")
-            raise
+    try:
+        outcome = _fit(config, what, resumed, console)
+    except KeyboardInterrupt:  # during training, `Interrupt` defers signals
+        console.print("stopped before training began: nothing was written")
+        raise
     folder = outcome.run.path
     if outcome.signal is not None:
         check_saved(outcome)
@@ -137,6 +133,22 @@ def _train(
         raise
     check_saved(outcome)
     return 0
+
+
+def _fit(
+    config: TrainConfig,
+    what: str,
+    resumed: tuple[Run, Checkpoint | None] | None,
+    console: Console,
+) -> Outcome:
+    """Train with the live view; the trainer and the files that it maps are gone at the end."""
+    with ExitStack() as stack:
+        view = DurationView(console, _scale(config))
+        with console.status("building the scene and timing this machine", spinner="line"):
+            trainer = stack.enter_context(Trainer(config, [view], resumed=resumed))
+        done = resumed[1].step if resumed and resumed[1] else 0
+        console.print(_outlook(trainer.setup, what, done), highlight=False)
+        return trainer.fit()
 
 
 def check_saved(outcome: Outcome) -> None:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from merl.core import EvaluationFailed, MerlError
 from merl.core.signals import Interrupt
 from merl.envs.wrappers import in_one_line
-from merl.evaluation.evaluation import Evaluation, Policy, evaluate
+from merl.evaluation.evaluation import Evaluation, evaluate
+from merl.evaluation.policy import Policy
 from merl.runs.metrics import MetricsWriter
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line

@@ -8,9 +8,10 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from merl.acting.environments import Environments, InProcessEnvs, WorkerEnvs
+from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.acting.run_env import own_bounds
+from merl.acting.workers import WorkerEnvs
 from merl.config import TrainConfig
 from merl.core import (
     EnvironmentFailed,

@@ -1,0 +1,295 @@
+"""Environments in worker processes, which step while the learner updates."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import signal
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.vector.async_vector_env import AsyncState
+from numpy.typing import NDArray
+
+from merl.acting.environments import Step, WorkerDied
+from merl.acting.generators import seed_global_generators
+from merl.acting.run_env import (
+    EnvSpaces,
+    environment_state,
+    make_run_env,
+    set_environment_state,
+)
+from merl.config import TrainConfig
+from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
+from merl.core.output import tolerate_lost_output
+from merl.core.python_path import set_value, users_value, working_folder_hidden
+from merl.envs.user_env import imports_code, load_module, module_folder
+
+_INFO = ("success", "reward_terms")
+"""Keys of an environment's info that the training loop uses."""
+_INFO_KEY = "reported"
+"""The only key of a worker's info; its value holds the `_INFO` entries of the environment."""
+_IGNORED_SIGNALS = (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
+"""Signals that workers ignore: a terminal or a batch system sends them to the workers, too, but the
+workers must continue until the run has saved and ends them. SIGTERM ends a worker."""
+START_SECONDS = 300.0
+"""Time limit within which all processes must have made their environments."""
+END_SECONDS = 5.0
+"""Time limit within which the processes must have ended; after that they are killed."""
+
+
+class WorkerEnvs:
+    """Environments in worker processes that step in parallel.
+
+    The processes are spawned (a fork with OpenGL or threads hangs), return observations through
+    shared memory, and end with this process. If one dies or does not answer in time, `restart`
+    starts all of them again.
+
+    Args:
+        config: the config of the run; uses `num_envs` and `worker_timeout` (seconds).
+        here: the same environment in this process; only its spaces are used.
+
+    Raises:
+        EnvironmentsLost: the processes cannot be started.
+    """
+
+    def __init__(self, config: TrainConfig, here: gymnasium.Env[Any, Any]) -> None:
+        self.count, self.action_shape = config.num_envs, here.action_space.shape or ()
+        self._config, self._here, self._timeout = config, here, config.worker_timeout
+        self._lost: str | None = None  # why a process is lost
+        try:
+            self._env = self._started()
+        except WorkerDied as lost:
+            raise EnvironmentsLost(
+                f"an environment's process {lost} while it started: see its output above"
+            ) from None
+
+    def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
+        """See `Environments`."""
+        which = np.array([index in seeds for index in range(self.count)])
+        with self._loss():
+            self._env.reset_async(
+                [seeds.get(index) for index in range(self.count)], {"reset_mask": which}
+            )
+            observations, _ = self._env.reset_wait(self._timeout)
+        return {index: _nth(observations, index) for index in seeds}
+
+    def send(self, actions: NDArray[np.float32]) -> None:
+        """See `Environments`."""
+        with self._loss():
+            self._env.step_async(actions)
+
+    def receive(self) -> list[Step]:
+        """See `Environments`."""
+        with self._loss():
+            observations, rewards, terminated, truncated, infos = self._env.step_wait(self._timeout)
+        return [
+            Step(
+                _nth(observations, index),
+                float(rewards[index]),
+                bool(terminated[index]),
+                bool(truncated[index]),
+                infos[_INFO_KEY][index][0],
+            )
+            for index in range(self.count)
+        ]
+
+    def states(self) -> list[dict[str, Any]]:
+        """See `Environments`."""
+        return [*self._call("state")]
+
+    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        """See `Environments`."""
+        self._call("restore", list(states))
+
+    def restart(self) -> None:
+        """See `Environments`."""
+        self.close()
+        self._env = self._started()
+
+    def close(self) -> None:
+        """See `Environments`."""
+        _end(self._env)
+
+    @contextmanager
+    def _loss(self) -> Iterator[None]:
+        """Convert a lost process into `WorkerDied`, in all later calls too, until a restart."""
+        if self._lost is not None:
+            raise WorkerDied(self._lost)
+        try:
+            yield
+        except multiprocessing.TimeoutError:
+            self._lost = "did not answer in time"
+        except (EOFError, ConnectionError):
+            self._lost = "died"
+        except MerlError:
+            self._lost = "failed"  # its pipe is closed, so it cannot be used again
+            raise
+        if self._lost is not None:
+            raise WorkerDied(self._lost)
+
+    def _call(self, name: str, *args: Any) -> tuple[Any, ...]:
+        with self._loss():
+            self._env.call_async(name, *args)
+            return self._env.call_wait(self._timeout)
+
+    def _started(self) -> AsyncVectorEnv:
+        self._lost = None
+        expected = EnvSpaces.of(self._config, self._here)
+        folder = module_folder(self._config.task)
+        makers = [
+            _Maker(self._config, index, expected, self._here, folder) for index in range(self.count)
+        ]
+        others = multiprocessing.active_children()
+        with (
+            self._loss(),
+            _killing_after(
+                START_SECONDS, lambda: set(multiprocessing.active_children()) - {*others}
+            ),
+            working_folder_hidden(),
+        ):
+            # The exception of a worker is raised here; Gymnasium must not print it as well.
+            gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
+            return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+
+
+@contextmanager
+def _killing_after(
+    seconds: float, processes: Callable[[], Iterable[BaseProcess]]
+) -> Iterator[None]:
+    """Kill processes if the block takes longer, so that waiting for them ends."""
+    timer = Timer(seconds, lambda: _kill(processes()))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _kill(processes: Iterable[BaseProcess]) -> None:
+    for process in processes:
+        process.kill()
+
+
+def _end(env: AsyncVectorEnv) -> None:
+    """End the worker processes in any state."""
+    with _killing_after(END_SECONDS, lambda: env.processes):
+        try:
+            env.close()
+        except Exception:  # a pipe or a process is lost: a regular close is impossible
+            _kill(env.processes)
+            env._state = AsyncState.DEFAULT  # do not wait for an answer
+            with suppress(Exception):
+                env.close(terminate=True)
+
+
+def _nth(batch: Mapping[str, Any], index: int) -> dict[str, Any]:
+    """Return the observation of one environment from a batched observation."""
+    return {key: value[index] for key, value in batch.items()}
+
+
+@contextmanager
+def _picklable_errors() -> Iterator[None]:
+    """Replace an exception that cannot be pickled; else the main process would wait forever."""
+    try:
+        yield
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            raise RuntimeError(f"{type(error).__name__}: {error}") from None
+        raise
+
+
+class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment in a worker process, with methods to save and restore its state."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], index: int) -> None:
+        super().__init__(env)
+        self._index = index
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        if options.get("seed") is not None:
+            seed_global_generators(options["seed"])
+        with _picklable_errors():
+            observation, _ = self.env.reset(**options)
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        with _picklable_errors():
+            observation, reward, terminated, truncated, info = self.env.step(action)
+        reported = {name: info[name] for name in _INFO if name in info}
+        # In a tuple, so that Gymnasium does not merge it with the info of other environments.
+        return observation, reward, terminated, truncated, {_INFO_KEY: (reported,)}
+
+    def state(self) -> dict[str, Any]:
+        with _picklable_errors():
+            return environment_state(self.env)
+
+    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        with _picklable_errors():
+            set_environment_state(self.env, states[self._index])
+
+
+class _StandIn(gymnasium.Env[Any, Any]):
+    """A dummy environment that only provides spaces.
+
+    Args:
+        expected: the spaces.
+        error: raised by `reset`. It tells why the real environment cannot be used; an exception
+            during the start of a worker would not reach the run.
+    """
+
+    def __init__(self, expected: EnvSpaces, error: MerlError | None = None) -> None:
+        self.observation_space, self.action_space = expected.observation, expected.action
+        self._error = error
+
+    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+        if self._error is not None:
+            raise self._error
+        raise NotImplementedError
+
+
+@dataclass
+class _Maker:
+    """A function that makes an environment in a worker process."""
+
+    config: TrainConfig
+    index: int
+    expected: EnvSpaces
+    here: gymnasium.Env[Any, Any] | None
+    folder: Path | None
+    """The folder from which the module of a user's environment was loaded."""
+    safe_path: str | None = field(default_factory=users_value)
+    """The user's value of `PYTHONSAFEPATH`, for Python processes that the environment starts."""
+
+    def __call__(self) -> gymnasium.Env[Any, Any]:
+        if self.here is not None:
+            return _StandIn(self.expected)
+        for number in _IGNORED_SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+        if imports_code(self.config.task):
+            set_value(self.safe_path)
+        tolerate_lost_output()
+        with _picklable_errors():
+            if self.folder is not None:
+                load_module(self.config.task, self.folder)
+            env = make_run_env(self.config)
+        try:
+            self.expected.check(EnvSpaces.of(self.config, env), f"that of worker {self.index}")
+        except MerlError as error:
+            env.close()
+            env = _StandIn(self.expected, EnvironmentFailed(str(error)))
+        return _Worker(env, self.index)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "here": None}

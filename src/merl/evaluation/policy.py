@@ -1,0 +1,237 @@
+"""Policies of saved runs: loaded from a run folder, they act on single observations."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from merl.acting.rollout import FrameStack
+from merl.acting.run_env import make_run_env, own_bounds, run_spaces
+from merl.agents import make_agent
+from merl.config import TrainConfig
+from merl.core import Agent, MerlError, NotFinite, Observation, is_image
+from merl.envs.user_spaces import Modality
+from merl.evaluation.evaluation import Evaluation, evaluate
+from merl.evaluation.video import MIN_SIDE
+from merl.runs.checkpoint import Checkpoint, load_networks, readable
+from merl.runs.run import Run
+
+
+class Policy:
+    """A trained agent that acts on single observations; it stacks the frames itself.
+
+    Call `reset()` at the start of each episode, then call the policy with each observation.
+
+    Attributes:
+        config: the config of its run.
+        step: environment steps at which the policy was saved.
+        reports_success: whether the environment was known to report success at that step.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        config: TrainConfig,
+        space: spaces.Dict,
+        device: torch.device,
+        step: int = 0,
+        run: Run | None = None,
+        reports_success: bool = False,
+    ) -> None:
+        self.config, self.step, self._run = config, step, run
+        self.reports_success = reports_success
+        self._agent = agent
+        self._modalities = {key: _as_trained(key, space[key]) for key in agent.senses}
+        images = tuple(key for key in agent.senses if is_image(space[key]))
+        self._stack = FrameStack(config.replay.frame_stack, images, device)
+        self._fresh = True
+
+    def reset(self) -> None:
+        """Start a new episode: discard the stacked frames."""
+        self._fresh = True
+
+    def __call__(self, observation: Observation) -> NDArray[np.float32]:
+        """Return the action for an observation.
+
+        Args:
+            observation: an observation of the environment: images uint8 (H, W, C), vectors float
+                (n,).
+
+        Returns:
+            The action, float32 (A,), in [-1, 1].
+
+        Raises:
+            MerlError: a key is missing, has another shape or type than in training, or cannot be
+                converted to an array.
+            NotFinite: the observation contains NaN or infinity.
+        """
+        sensed = {key: self._checked(key, observation) for key in self._modalities}
+        if self._fresh:
+            self._stack.reset(sensed)
+        else:
+            self._stack.push(sensed)
+        self._fresh = False
+        action = self._agent.act(self._stack.observation(), explore=False)[0]
+        result: NDArray[np.float32] = action.to("cpu", torch.float32).numpy()
+        return result
+
+    def make_env(self, *, trust: bool = False, **changes: Any) -> gymnasium.Env[Any, Any]:
+        """Make the environment of the run, with the start states of its evaluations.
+
+        Args:
+            trust: import the environment that the run names, although you have not trained this run
+                on this machine. This runs code of the author of the run. It is not needed for the
+                environments of merl and Gymnasium.
+            **changes: fields of `EnvConfig`, and `render_mode`; the renderer `auto` is the renderer
+                of the training.
+
+        Raises:
+            MerlError: the environment is not trusted, cannot be made, or has other spaces than in
+                training.
+        """
+        renderer = changes.get("renderer", self.config.env.renderer)
+        if renderer == "auto" and not self.config.own_env:
+            renderer = changes["renderer"] = self.config.env.renderer
+        if renderer != self.config.env.renderer and not self.config.own_env:
+            warnings.warn(
+                f"the agent was trained with renderer {self.config.env.renderer!r} but now uses "
+                f"{renderer!r}: their images differ, and the agent may perform worse",
+                stacklevel=2,
+            )
+            changes.setdefault("samples", 1)  # the recorded value is for that renderer
+        if self._run is not None:
+            self._run.load_module(trusted=trust)
+        env = make_run_env(self.config.evaluated, **changes)
+        if self._run is not None and self.config.own_env:
+            try:
+                self._run.check_environment(*run_spaces(self.config, env), own_bounds(env))
+            except BaseException:
+                env.close()
+                raise
+        return env
+
+    def evaluate(
+        self,
+        *,
+        episodes: int = 10,
+        video: Path | None = None,
+        renderer: str | None = None,
+        max_episode_steps: int | None = None,
+        trust: bool = False,
+    ) -> Evaluation:
+        """Run episodes without noise, from the evaluation's fixed start states.
+
+        Args:
+            episodes: number of episodes, at least 1.
+            video: record the first episode into this MP4 file.
+            renderer: draws the images; None: the renderer of the training.
+            max_episode_steps: limit in steps for episodes that do not end earlier; None: as in the
+                run.
+            trust: see `make_env`.
+
+        Raises:
+            MerlError: the environment cannot be made or failed, or the video cannot be written.
+            NotFinite: a reward or an observation is NaN or infinite.
+        """
+        changes: dict[str, Any] = {} if renderer is None else {"renderer": renderer}
+        if video is not None:
+            size = max(self.config.env.render_size, MIN_SIDE)
+            changes |= {"render_mode": "rgb_array", "render_size": size}
+        limits = self.config.eval
+        if max_episode_steps is not None:
+            limits = dataclasses.replace(limits, max_episode_steps=max_episode_steps)
+        config = dataclasses.replace(self.config, eval=limits)
+        env = self.make_env(trust=trust, **changes)
+        try:
+            return evaluate(
+                self,
+                env,
+                episodes,
+                reset=self.reset,
+                video=video,
+                max_steps=config.eval_steps,
+                reports_success=self.reports_success,
+            )
+        finally:
+            env.close()
+
+    def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
+        if not isinstance(observation, Mapping):
+            raise MerlError(
+                f"the observation is a {type(observation).__name__}: give a dict with the keys "
+                f"{list(self._modalities)}"
+            )
+        if key not in observation:
+            raise MerlError(
+                f"the observation lacks {key!r}: the agent needs {list(self._modalities)}"
+            )
+        value = self._modalities[key].convert(observation[key])
+        if not np.isfinite(value).all():
+            raise NotFinite(f"observation {key!r} contains NaN or infinity: {value}")
+        return value
+
+
+def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
+    """Return the check of an observation key that needs no conversion."""
+    assert isinstance(space, spaces.Box)
+    return Modality(key, space, space)
+
+
+def load_policy(
+    run: str | Path, *, checkpoint: str | int = "latest", threads: int | None = 1
+) -> Policy:
+    """Load the policy of a run; no code of the run is imported or executed.
+
+    Args:
+        run: the folder of the run.
+        checkpoint: "latest", "best" (by evaluation return), or the number of steps of a checkpoint.
+        threads: CPU threads that compute an action; None uses torch's setting. For a single
+            observation, several threads mostly wait for each other. Torch's setting for the rest of
+            the program is restored after each action.
+
+    Raises:
+        MerlError: there is no run or no complete checkpoint in it, or `threads` is not possible.
+    """
+    most = os.cpu_count() or 1
+    if threads is not None and (type(threads) is not int or not 1 <= threads <= most):
+        raise MerlError(
+            f"threads is {threads!r}: give None, or an integer from 1 to {most}, the number of "
+            "CPUs of this machine"
+        )
+    opened = Run.open(Path(run))
+    saved = Checkpoint.find(opened.checkpoints, str(checkpoint))
+    config, device = opened.config, torch.device("cpu")
+    if config.device == "cuda" and torch.cuda.is_available():
+        device = torch.device("cuda")
+    observation_space, action_space = opened.spaces()
+    agent = make_agent(
+        config.agent,
+        observation_space,
+        action_space,
+        frame_stack=config.replay.frame_stack,
+        seed=0,
+        device=device,
+        threads=threads,
+    )
+    load_networks(agent.networks, saved)
+    with readable(saved):
+        reports_success = bool(saved.state()["progress"].get("reports_success", False))
+    return Policy(
+        agent,
+        config,
+        observation_space,
+        device,
+        step=saved.step,
+        run=opened,
+        reports_success=reports_success,
+    )

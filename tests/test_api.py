@@ -70,7 +70,7 @@ class Recorder(merl.Callback):
 
 def test_train_calls_the_callbacks_and_evaluate_repeats_its_last_evaluation(tmp_path: Path) -> None:
     recorder = Recorder()
-    outcome = merl.train(TASK, callbacks=[recorder], run_dir=tmp_path / "run", **SMALL)
+    outcome = merl.train(TASK, callbacks=[recorder], run_dir=f"{tmp_path}/run", **SMALL)
     assert outcome.progress.step == 60
     assert recorder.outcome is not None
     assert recorder.outcome.run.path == outcome.run.path == tmp_path / "run"
@@ -91,6 +91,8 @@ def test_train_calls_the_callbacks_and_evaluate_repeats_its_last_evaluation(tmp_
     again = merl.evaluate(tmp_path / "run", episodes=2)
     assert outcome.evaluation is not None
     assert again.returns == outcome.evaluation.returns
+    with pytest.raises(MerlError, match="episodes must be at least 1, not 0"):
+        merl.evaluate(tmp_path / "run", episodes=0)
 
 
 def test_a_callback_stops_training_and_the_run_is_saved(tmp_path: Path) -> None:

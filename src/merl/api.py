@@ -40,7 +40,7 @@ def train(
             `task` is a config.
         callbacks: called while it trains.
         overrides: values of `TrainConfig` by name, nested ones by their dotted name, as on the
-            command line: `steps=1000, **{"agent.noise_std": 0.3}`.
+            command line: `steps=1000, **{"agent.noise_std": 0.3}`. `run_dir` may be a string.
 
     Returns:
         The run's folder and config, its last evaluation, and how it ended.
@@ -52,6 +52,8 @@ def train(
         config = compose(preset or default_preset(), task, agent, setting)
     else:
         config = task
+    if overrides.get("run_dir") is not None:
+        overrides["run_dir"] = Path(overrides["run_dir"])
     with Trainer(override(config, overrides), callbacks) as trainer:
         return trainer.fit()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,8 +19,8 @@ from merl.training.updating import Recorded
 SPACE = spaces.Dict({"joints": spaces.Box(-1, 1, (5,), np.float32)})
 
 
-def make(actor_every: int) -> DDPG:
-    config = MERLConfig(latent_dim=8, hidden_dim=8, precision="fp32", actor_every=actor_every)
+def make(**values: Any) -> DDPG:
+    config = MERLConfig(latent_dim=8, hidden_dim=8, precision="fp32", **values)
     actions = spaces.Box(-1, 1, (2,), np.float32)
     device = torch.device("cpu")
     return make_agent(config, SPACE, actions, frame_stack=1, seed=0, device=device, threads=1)
@@ -68,3 +68,15 @@ def test_each_kind_of_update_has_its_own_warm_up_and_recording(
         "replay"
     ] * 2
     assert ["actor_loss" in each for each in metrics] == kinds
+
+
+def test_recorded_update_sets_the_step_size_before_it_learns() -> None:
+    """A replayed graph does not run `learn`, so the step size is set outside of it."""
+    agent = make(learning_rate=1e-3, learning_rate_end=1e-4, learning_rate_steps=10)
+    batch = random_batch()
+    recorded = Recorded(agent, lambda: batch)
+    for step, rate in ((0, 1e-3), (5, 5.5e-4), (20, 1e-4)):
+        agent.step = step
+        recorded()
+        for optimizer in (agent.critic_optimizer, agent.actor_optimizer):
+            assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)

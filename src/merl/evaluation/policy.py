@@ -143,6 +143,8 @@ class Policy:
             MerlError: the environment cannot be made or failed, or the video cannot be written.
             NotFinite: a reward or an observation is NaN or infinite.
         """
+        if episodes < 1:
+            raise MerlError(f"episodes must be at least 1, not {episodes}")
         changes: dict[str, Any] = {} if renderer is None else {"renderer": renderer}
         if video is not None:
             size = max(self.config.env.render_size, MIN_SIDE)

@@ -344,7 +344,7 @@ def test_a_run_without_updates_is_reported(
 
 
 def test_an_unused_observation_is_not_computed(tmp_path: Path) -> None:
-    arguments = train_arguments(tmp_path / "run", "--steps", "300", "--agent.images")
+    arguments = train_arguments(tmp_path / "run", "--steps", "300", "--agent.keys", "proprio")
     assert main(arguments) == 0
     record = json.loads((tmp_path / "run" / "config.json").read_text())
     assert list(record["observation_space"]) == ["proprio"]
@@ -382,10 +382,10 @@ BAD = {
     "train reach_duplo --agent.tau 1.01": "(0, 1], not 1.01",
     "train reach_duplo --agent.tau nan": "(0, 1], not nan",
     "train reach_duplo --agent.latent-dim 3": "leaves 1 for each of 2 modalities",
-    "train reach_duplo --observations state": "--agent.vectors state",
+    "train reach_duplo --observations state": "--agent.keys state",
     "train reach_duplo --updates-per-step inf": "must be finite and at least 0, not inf",
     "train reach_duplo --num-envs 0": "num-envs must be at least 1 and at most 1,024, not 0",
-    "train reach_duplo --agent.vectors joints": "the environment gives ['proprio', 'state']",
+    "train reach_duplo --agent.keys joints": "the observation has ['depth', 'image', 'proprio'",
     "train reach_duplo --image-size 8": "16",
     "train reach_duplo --renderer wrap": "'gl', 'raster'",
     "train reach_duplo --renderer raster --samples 5": "samples is 5: give a whole number",

@@ -172,7 +172,7 @@ def test_observations_that_contradict_their_space_are_rejected(
     spaces_by_key = {"top": image(20, 20, 3), "arm": vector(2)}
     env = WrongObservationEnv(spaces.Dict(spaces_by_key))
     adapted = adapt(env)
-    adapted.modalities = {key: adapted.modalities[key] for key in keys}  # type: ignore[attr-defined]
+    adapted.keys = {key: adapted.keys[key] for key in keys}  # type: ignore[attr-defined]
     with pytest.raises(MerlError, match=message):
         adapted.reset()
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.acting.environments import InProcessEnvs
@@ -16,6 +17,7 @@ from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.config import TrainConfig
+from merl.modalities import Image, modalities_of
 from merl.replay import ReplayBuffer, ReplayConfig
 from merl.replay.on_device import OnDevice
 from merl.training import loop
@@ -57,7 +59,9 @@ class SmallRun:
         self.progress = Progress()
         self.update: Update = update_from_host(self.agent, self.replay, self.randomness, config)
         self.collector = Collector(
-            InProcessEnvs(self.env), self.replay, [FrameStack(3, ("image",), CPU)]
+            InProcessEnvs(self.env),
+            self.replay,
+            [FrameStack(modalities_of(self.env.observation_space), 3, CPU)],
         )
 
     def results(self) -> Iterator[StepResult]:
@@ -287,7 +291,8 @@ def test_the_seed_determines_the_weights() -> None:
 
 def test_the_frame_stack_for_acting_equals_that_of_the_replay() -> None:
     run = SmallRun(dataclasses.replace(CONFIG, steps=10, seed_steps=10))
-    env, stack = DotEnv(), FrameStack(3, ("image",), CPU)
+    env = DotEnv()
+    stack = FrameStack(modalities_of(env.observation_space), 3, CPU)
     run.finish()
     observation, _ = env.reset(seed=run.randomness.environment())
     stack.reset(observation)
@@ -352,7 +357,8 @@ def test_the_success_share_counts_only_steps_with_a_report() -> None:
 def test_a_reused_frame_does_not_change_the_stack() -> None:
     """A camera driver may return the same array in every step."""
     buffer = np.zeros((2, 2, 1), np.uint8)
-    stack = FrameStack(3, ("camera",), CPU)
+    modalities = {"camera": Image(spaces.Box(0, 255, (2, 2, 1), np.uint8))}
+    stack = FrameStack(modalities, 3, CPU)
     stack.reset({"camera": buffer})
     for value in (1, 2):
         buffer[:] = value

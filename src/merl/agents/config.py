@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from merl.core import MerlError, check_choice
-from merl.networks.fusion import Squash
+from merl.core import Kind, MerlError, check_choice
+from merl.networks.fusion import FusionLayer
 from merl.networks.returns import HLGauss
 
 Precision = Literal["auto", "fp32", "bf16"]
@@ -25,14 +25,23 @@ WIDEST = 65_536
 class AgentConfig:
     """Networks of an agent and how it learns; the defaults are from Table 1 and Appendix C.1."""
 
-    images: tuple[str, ...] | None = None
-    """Image keys to use; if not set, every image that the environment gives."""
-    vectors: tuple[str, ...] | None = None
-    """Vector keys to use; if not set, every vector that the environment gives, except the
+    keys: tuple[str, ...] | None = None
+    """Observation keys to use; if not set, every key of the kinds in `modalities`, except the
     privileged ones. In merl's own tasks, `state` is used only if it is named."""
+    modalities: tuple[Kind, ...] = get_args(Kind)
+    """Kinds of observations to use if `keys` is not set."""
     privileged: tuple[str, ...] = ()
-    """Vector keys that only the critic observes, e.g. `state`: known in training only (asymmetric
+    """Keys that only the critic observes, e.g. `state`: known in training only (asymmetric
     critic)."""
+    encoders: dict[str, str] = field(default_factory=dict)
+    """Encoder of a key, by its name (`--agent.encoders.wrist impala`): conv, impala or a model of
+    timm for images; identity, mlp, conv1d or transformer for numbers; or `module:Class`. If not
+    set: conv for images, identity for vectors, conv1d for histories."""
+    encoder_weights: dict[str, str] = field(default_factory=dict)
+    """File with the initial weights of a key's encoder, for models of timm. It is read once, when
+    the run starts."""
+    frozen_encoders: tuple[str, ...] = ()
+    """Keys whose encoders are not trained."""
     learning_rate: float = 1e-4
     """Step size of Adam, for every network."""
     learning_rate_end: float | None = None
@@ -80,21 +89,22 @@ class AgentConfig:
     fusion: FusionOwner = "decoupled"
     """Fusions of critic and actor (Figure 3a): one each (decoupled), or one for both, trained by
     the critic's loss (shared) or by both losses (shared_by_both)."""
+    fusion_layer: FusionLayer = "tanh"
+    """What the fusion applies to each key's linear projection: tanh (MERL), a softmax over groups
+    of eight numbers (simnorm), or attention between the keys and tanh (attention)."""
     fusion_norm: bool = True
     """LayerNorm in the fusion (Figure 3c)."""
-    squash: Squash = "tanh"
-    """Bound of the fused representation: tanh, or a softmax over groups of eight (simnorm)."""
     shift_pad: int = 4
     """Random shift, in pixels to each side; 0 disables it."""
     conv_channels: int = 32
     """Channels of each convolution of the image encoder."""
     conv_strides: tuple[int, ...] = (2, 1, 1, 1)
     """Strides of the image encoder's convolutions."""
-    vector_encoder_dim: int = 0
-    """Width of the MLP that encodes each vector; 0 disables the MLP (Figure 5)."""
+    mlp_dim: int = 64
+    """Width of encoder `mlp` (Figure 5)."""
     standardize: bool = False
-    """Standardise each vector by the mean and the deviation of the first batches; the paper uses
-    raw vectors."""
+    """Standardise vectors and histories by the mean and the deviation of the first batches; the
+    paper uses raw vectors."""
     head_layers: int = 3
     """Linear layers of actor and critic, with the output layer (paper: 3 for reach, else 6)."""
     hidden_dim: int = 1024
@@ -115,7 +125,8 @@ class AgentConfig:
         for name, choice, choices in (
             ("precision", self.precision, get_args(Precision)),
             ("target", self.target, get_args(Target)),
-            ("squash", self.squash, get_args(Squash)),
+            ("fusion-layer", self.fusion_layer, get_args(FusionLayer)),
+            *(("modalities", kind, get_args(Kind)) for kind in self.modalities),
             ("critic-loss", self.critic_loss, get_args(CriticLoss)),
             ("fusion", self.fusion, get_args(FusionOwner)),
             ("torch-compile", self.torch_compile, get_args(TorchCompile)),
@@ -135,7 +146,7 @@ class AgentConfig:
             raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
         least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1}
         least |= {"noise_steps": 1, "learning_rate_steps": 1, "critic_bins": HLGauss.FEWEST}
-        least |= {"actor_every": 1, "latent_dim": 0, "shift_pad": 0, "vector_encoder_dim": 0}
+        least |= {"actor_every": 1, "latent_dim": 0, "shift_pad": 0, "mlp_dim": 1}
         for name, bound in least.items():
             most = 10**12 if name.endswith("_steps") else WIDEST
             if not bound <= getattr(self, name) <= most:
@@ -144,7 +155,7 @@ class AgentConfig:
                     f"not {getattr(self, name)}"
                 )
         self._check_histogram()
-        for name in ("fusion", "fusion_norm", "squash"):
+        for name in ("fusion", "fusion_norm", "fusion_layer"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):
                 raise MerlError(
                     f"agent.{_flag(name)} {getattr(self, name)} is an option of the fusion, "

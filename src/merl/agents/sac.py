@@ -29,10 +29,8 @@ from merl.networks.settings import with_torch_settings
 class SACConfig(AgentConfig):
     """SAC on the state, with a learnt temperature (Haarnoja et al. 2018b)."""
 
-    images: tuple[str, ...] | None = ()
-    """Image keys to use: none."""
-    vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to use."""
+    keys: tuple[str, ...] | None = ("state",)
+    """Observation keys to use."""
     latent_dim: int = 0
     """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
     head_norm: bool = False

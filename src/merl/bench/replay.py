@@ -20,7 +20,8 @@ from merl.bench.measuring import Work, circumstances, seconds, shown, spread, ta
 from merl.core import FrameTransforms, MerlError, Transition
 from merl.core.resources import free_disk
 from merl.envs import make_env
-from merl.networks.augmentation import RandomShift, draw_shifts, to_input
+from merl.modalities import Image
+from merl.networks.augmentation import RandomShift, draw_shifts
 from merl.replay import EpisodeRing, ReplayConfig, replay_bytes
 
 EPISODE, PAD, MILLION = 250, 4, 1_000_000
@@ -191,7 +192,9 @@ def _stages(ring: EpisodeRing, batch_size: int) -> dict[str, Work]:
         shifts = (draw_shifts(batch_size, PAD, generator) for _ in range(2))
         return sample(*({"image": RandomShift(each, PAD)} for each in shifts))
 
+    image = Image(spaces.Box(0, 255, (84, 84, 3), np.uint8))
+
     def as_input() -> list[Tensor]:
-        return [to_input(stack, torch.float32) for stack in ready()]
+        return [image.centred(stack, torch.float32) for stack in ready()]
 
     return dict(zip(STAGES, (sample, ready, as_input), strict=True))

@@ -16,7 +16,7 @@ from merl.cli.duration import DurationView, duration
 from merl.cli.output import make_console
 from merl.cli.summary import summarize
 from merl.config import TrainConfig
-from merl.core import MerlError, NotSaved, counted, is_image
+from merl.core import MerlError, NotSaved, counted
 from merl.replay import replay_bytes
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint, readable
@@ -188,7 +188,7 @@ def _outlook(setup: Setup, what: str, done: int) -> str:
         config.replay, setup.space, setup.action_space, config.capacity, config.num_envs
     )
     updates = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
-    has_images = not config.own_env and any(is_image(space) for space in setup.space.values())
+    has_images = not config.own_env and any(m.stacked for m in setup.spec.modalities.values())
     images = f" ({config.env.renderer} images)" if has_images else ""
     lines = [f"{what}: {duration(config, timing, done)}"]
     if timing.seconds(config, done) > DAY and config.preset != "laptop":

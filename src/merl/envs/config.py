@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from merl.core import MerlError, check_choice
+from merl.core import Kind, MerlError, check_choice
 
 RendererName = Literal["gl", "raster"]
 RendererChoice = Literal["auto", "gl", "raster"]
@@ -18,7 +18,16 @@ StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding", "carrying"]
 RewardName = Literal["paper", "staged"]
 ImageLayout = Literal["auto", "hwc", "chw"]
-OBSERVATIONS = ("image", "proprio", "state")
+OBSERVATION_KINDS: dict[str, Kind] = {
+    "image": "image",
+    "depth": "depth",
+    "proprio": "vector",
+    "touch": "vector",
+    "state": "vector",
+}
+"""Keys of an observation of merl's own tasks, with their kinds."""
+DEPTH_RANGE = (0.0, 2.0)
+"""Bounds of `depth`, m; greater distances, such as those of the sky, are clipped."""
 SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
 MOST_SAMPLES = 4
 REMOVED = {
@@ -57,7 +66,9 @@ class EnvConfig:
     target) or `relative` (also the vectors from hand to object and from object to target)."""
 
     observations: tuple[str, ...] = ("image", "proprio")
-    """Keys of an observation: any of `image`, `proprio`, `state`. Other keys are not computed."""
+    """Keys of an observation: any of `image`, `depth` (of the same camera, m), `proprio`, `touch`
+    (forces on the palm and the six links of the fingers) and `state`. Other keys are not
+    computed."""
 
     occluded: bool = False
     """Put a disc between the camera and the object, for `move_box` and `lift_box`. Where the camera
@@ -88,10 +99,10 @@ class EnvConfig:
         if isinstance(self.observations, str) or not self.observations:
             raise MerlError(
                 f"observations is {self.observations!r}: give a tuple of at least one of "
-                f"{', '.join(OBSERVATIONS)}"
+                f"{', '.join(OBSERVATION_KINDS)}"
             )
         for name in self.observations:
-            check_choice("observations", name, OBSERVATIONS)
+            check_choice("observations", name, tuple(OBSERVATION_KINDS))
         starts = get_args(StartName)
         if isinstance(self.start, str) or not self.start:
             raise MerlError(

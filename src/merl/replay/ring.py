@@ -27,7 +27,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from merl.core import Batch, FrameTransforms, MerlError, Observation, Transition, is_image
+from merl.core import Batch, FrameTransforms, MerlError, Observation, Transition
+from merl.modalities import modalities_of
 from merl.replay.compression import CompressedPictures
 from merl.replay.config import ReplayConfig, check_fits, slots_for
 from merl.replay.journal import Journal
@@ -122,7 +123,7 @@ class EpisodeRing:
         self._images: dict[str, Pictures] = {
             name: self._compressed[name] if name in self._compressed else RawPictures(arrays[name])
             for key, name in self.keys.items()
-            if is_image(observation_space[key])
+            if modalities_of(observation_space)[key].stacked
         }
         self._journal: Journal | None = None
         if directory is not None:

@@ -24,8 +24,9 @@ from urllib.parse import quote
 import gymnasium
 import numpy as np
 
-from merl.core import MerlError, is_image, is_vector
+from merl.core import MerlError
 from merl.core.resources import reserve_file
+from merl.modalities import modality_of
 from merl.replay.compression import reserved_bytes
 from merl.replay.ring_index import Move, RingIndex
 
@@ -91,19 +92,16 @@ def fields_of(
     fields: dict[str, Field] = {}
     for key, space in observation_space.spaces.items():
         shape = space.shape or ()
-        whole = isinstance(space, gymnasium.spaces.Box) and math.prod(shape) > 0
-        if whole and is_image(space):
-            dtype: np.dtype[Any] = np.dtype("u1")
-            if compress:
-                shape = (reserved_bytes(math.prod(shape)),)
-                fields[span_name(key)] = Field(np.dtype("<i8"), (2,))
-        elif whole and is_vector(space):
-            dtype = np.dtype("<f4")
-        else:
+        modality = modality_of(space)
+        if modality is None:
             raise MerlError(
                 f"observation {key!r} is {space}: replay stores images, Box(H, W, C) of uint8, and "
                 "vectors, Box(n) of floats; convert the key in a wrapper, or remove it"
             )
+        dtype = modality.stored
+        if compress and modality.stacked:
+            shape, dtype = (reserved_bytes(math.prod(shape) * dtype.itemsize),), np.dtype("u1")
+            fields[span_name(key)] = Field(np.dtype("<i8"), (2,))
         fields[field_name(key)] = Field(dtype, shape)
     if len(action_space.shape) != 1 or not math.prod(action_space.shape):
         raise MerlError(f"the action space is {action_space}: use a vector, Box(n)")

@@ -35,8 +35,7 @@ _LEFT_OPEN = {
     "threads": None,
     "agent.precision": "auto",
     "agent.torch_compile": "auto",
-    "agent.images": None,
-    "agent.vectors": None,
+    "agent.keys": None,
     "agent.critic_high": None,
 }
 """Values that leave a field open: merl chooses a value for this machine and records its choice."""

@@ -27,7 +27,7 @@ from gymnasium import spaces
 
 import merl
 from merl.agents import AGENTS
-from merl.agents.networks import modalities
+from merl.agents.networks import observation_spec
 from merl.config import TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
 from merl.envs.config import AUTO_RENDERER, check_not_removed
@@ -346,9 +346,8 @@ def _naming_its_keys(config: TrainConfig, space: spaces.Dict) -> TrainConfig:
 
     That version did not use `state` unless the config named it.
     """
-    images, vectors = modalities(config.agent, space)
-    agent = dataclasses.replace(config.agent, images=images, vectors=vectors)
-    return dataclasses.replace(config, agent=agent)
+    senses = observation_spec(config.agent, space, config.replay.frame_stack).senses
+    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, keys=senses))
 
 
 def _read(path: Path) -> dict[str, Any]:

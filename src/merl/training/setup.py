@@ -15,7 +15,7 @@ import torch
 from gymnasium import spaces
 
 from merl.acting.env_checks import check_instances
-from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces
+from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
@@ -44,6 +44,7 @@ class Setup:
         eval_env: the environment for evaluation; None without evaluations (`eval.every` is 0).
         home: the working folder at the start; a relative run folder is relative to it.
         records_video: whether `eval_env` renders images.
+        spec: what the agent observes.
         space: the observation space, with the keys that the agent uses.
         action_space: the action space.
         device: device of the networks.
@@ -61,6 +62,7 @@ class Setup:
     ) -> None:
         self.env, self.eval_env, self.home = env, eval_env, home
         self.records_video = eval_env is not None and eval_env.render_mode == "rgb_array"
+        self.spec = run_spec(config, env)
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
         bounded(config.agent, config.replay.discount)  # reject bad values before timing

@@ -20,7 +20,6 @@ from merl.core import (
     MerlError,
     NotFinite,
     counted,
-    is_image,
 )
 from merl.core.guards import LossGuard
 from merl.core.signals import Interrupt
@@ -274,9 +273,8 @@ class Trainer:
     def _steps(self) -> Iterable[StepResult]:
         """Return the loop of Algorithm 1, which yields after every step of the environments."""
         setup = self.setup
-        images = tuple(key for key in setup.space if is_image(setup.space[key]))
         stacks = [
-            FrameStack(self.config.replay.frame_stack, images, setup.device)
+            FrameStack(setup.spec.modalities, setup.spec.frame_stack, setup.device)
             for _ in range(self._environments.count)
         ]
         update = make_update(

@@ -26,7 +26,7 @@ from merl.config import TrainConfig
 from merl.core import counted, is_image
 from merl.core.resources import keep_freed_memory
 from merl.experiments.presets import compose
-from merl.replay import ReplayBuffer
+from merl.replay import ReplayBuffer, ReplaySpec
 from merl.training.loop import Collector, Progress, Randomness, train
 from merl.training.setup import choose_device
 from merl.training.timing import measure, use_threads
@@ -155,7 +155,8 @@ class _Loop:
         device, frames = choose_device(config.device), config.replay.frame_stack
         images = tuple(key for key in space if is_image(space[key]))
         count = environments.count
-        replay = ReplayBuffer(config.replay, space, actions, count=count, capacity=CAPACITY)
+        spec = ReplaySpec.of(config.replay, space, actions, capacity=CAPACITY, rings=count)
+        replay = ReplayBuffer(spec)
         stacks = [FrameStack(frames, images, device) for _ in range(count)]
         agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)
         self._progress = Progress()

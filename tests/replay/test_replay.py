@@ -26,8 +26,9 @@ from helpers import wait_for
 from merl.core import Batch, MerlError, Observation, Transition
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, check_fits, frames
 from merl.replay.frames import ReadAhead
+from merl.replay.on_device import OnDevice
 from merl.replay.ring import EpisodeRing
-from merl.replay.spec import span_name
+from merl.replay.spec import KeySpec, span_name
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
 OBSERVATIONS = gymnasium.spaces.Dict(
@@ -1045,3 +1046,84 @@ def test_file_in_place_of_the_directory_is_rejected(tmp_path):
     with pytest.raises(MerlError, match="cannot store a replay in"):
         make(tmp_path / "run" / "replay")
     assert (tmp_path / "run").read_text() == "a file"
+
+
+# Other types of frames
+
+FRAMES = ReplaySpec(
+    config(),
+    {
+        "depth": KeySpec(np.dtype("<u2"), (4, 5), stacked=True, compressible=True),
+        "heat": KeySpec(np.dtype("<f4"), (2, 3), stacked=True),
+        "label": KeySpec(np.dtype("u1"), (3, 4, 1)),
+        "touch": KeySpec(np.dtype("<f4"), (6, 2)),
+    },
+    ACTIONS.shape,
+    capacity=40,
+    rings=2,
+)
+
+
+def typed(ring: int, t: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng((ring, t))
+    return {
+        "depth": rng.integers(0, 65536, (4, 5)).astype(np.uint16),
+        "heat": rng.standard_normal((2, 3), np.float32),
+        "label": rng.integers(0, 256, (3, 4, 1)).astype(np.uint8),
+        "touch": rng.standard_normal((6, 2), np.float32),
+    }
+
+
+@pytest.mark.parametrize("storage", ["raw", "compressed", "device"])
+def test_frames_of_any_type_are_stored_and_stacked_exactly(tmp_path, storage):
+    spec = replace(FRAMES, config=config(compress=storage == "compressed"))
+    replay = ReplayBuffer(spec, tmp_path)
+    assert spec.compressed == (("depth",) if storage == "compressed" else ())
+    for t in range(45):  # both rings wrap
+        for ring in range(2):
+            if t == 0:
+                replay.begin(typed(ring, 0), ring)
+            else:
+                replay.add(Transition(act(ring, t - 1), 0.0, 1.0, typed(ring, t), False), ring)
+    if storage == "device":
+        copy = OnDevice(replay, torch.device("cpu"))
+        copy.follow()
+        batch = copy.sample(64, torch.Generator().manual_seed(0))
+    else:
+        batch = replay.sample(64, np.random.default_rng(0))
+    for number, (ring, t) in enumerate(batch.action.int().tolist()):
+        for key, stored in spec.keys.items():
+            for values, newest in (
+                (batch.observation[key], t),
+                (batch.next_observation[key], min(t + 3, 44)),
+            ):
+                expected = [typed(ring, newest - back)[key] for back in (2, 1, 0)]
+                value = values[number].numpy()
+                assert value.dtype == stored.dtype
+                np.testing.assert_array_equal(value, expected if stored.stacked else expected[-1])
+
+
+def test_frames_of_any_type_are_restored_after_growth(tmp_path):
+    spec = replace(FRAMES, config=config(compress=True), rings=1)
+    replay = ReplayBuffer(spec, tmp_path)
+    replay.begin(typed(0, 0))
+    for t in range(1, 70):
+        replay.add(Transition(act(0, t - 1), 0.0, 1.0, typed(0, t), False))
+    before = replay.sample(len(replay), Every())
+    larger = ReplayBuffer(replace(spec, capacity=90), tmp_path)
+    larger.load_state_dict(replay.state_dict())
+    after = larger.sample(len(larger), Every())
+    for key in spec.keys:
+        held = after.observation[key][-len(before.action) :].numpy()
+        np.testing.assert_array_equal(held, before.observation[key].numpy())
+
+
+def test_float_frames_cannot_be_compressed():
+    with pytest.raises(ValueError, match="cannot be compressed"):
+        KeySpec(np.dtype("<f4"), (2, 3), stacked=True, compressible=True)
+
+
+def test_value_of_another_integer_type_is_rejected():
+    replay = ReplayBuffer(replace(FRAMES, rings=1))
+    with pytest.raises(MerlError, match=r"depth is int32 \(4, 5\), but its space says uint16"):
+        replay.begin(typed(0, 0) | {"depth": np.zeros((4, 5), np.int32)})

@@ -18,7 +18,7 @@ from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.config import TrainConfig
 from merl.modalities import Image, modalities_of
-from merl.replay import ReplayBuffer, ReplayConfig
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.replay.on_device import OnDevice
 from merl.training import loop
 from merl.training.loop import (
@@ -55,7 +55,8 @@ class SmallRun:
         self.agent: DDPG = make_agent(
             config.agent, space, actions, frame_stack=3, seed=self.randomness.agent, device=CPU
         )
-        self.replay = ReplayBuffer(config.replay, space, actions, capacity=config.steps)
+        spec = ReplaySpec.of(config.replay, space, actions, capacity=config.steps)
+        self.replay = ReplayBuffer(spec)
         self.progress = Progress()
         self.update: Update = update_from_host(self.agent, self.replay, self.randomness, config)
         self.collector = Collector(
@@ -387,7 +388,7 @@ def test_updates_on_the_device_equal_those_from_the_host(agent: MERLConfig) -> N
     """The code for a GPU runs on the CPU; the twin makes the usual update from each batch."""
     run = SmallRun(dataclasses.replace(CONFIG, agent=agent))
     twin = SmallRun(run.config).agent
-    copy = OnDevice(run.replay.rings, CPU)
+    copy = OnDevice(run.replay, CPU)
     on_device = UpdateOnDevice(run.agent, copy, 8, seed=5)
     same = torch.Generator().manual_seed(5)
 

@@ -37,17 +37,20 @@ class FrameStack:
             for key, modality in modalities.items()
         }
 
-    def reset(self, observation: Observation) -> None:
-        """Start an episode with its first observation."""
+    def reset(self, observation: Observation) -> Observation:
+        """Start an episode with its first observation; return it as stored."""
         for _ in range(self._length):
-            self.push(observation)
+            stored = self.push(observation)
+        return stored
 
-    def push(self, observation: Observation) -> None:
-        """Add the observation after a step."""
+    def push(self, observation: Observation) -> Observation:
+        """Add the observation after a step; return it as stored."""
+        stored = {key: m.to_stored(observation[key]) for key, m in self._modalities.items()}
         for key, modality in self._modalities.items():
-            stored = modality.to_stored(observation[key])
             # An environment may reuse the array.
-            self._last[key].append(np.array(stored) if modality.stacked else stored)
+            value = stored[key].copy() if modality.stacked else stored[key]
+            self._last[key].append(value)
+        return stored
 
     def observation(self) -> dict[str, torch.Tensor]:
         """Return a batch of size one: (1, K, *shape) of stacked frames, else (1, *shape)."""

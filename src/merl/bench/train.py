@@ -26,7 +26,7 @@ from merl.config import TrainConfig
 from merl.core import counted
 from merl.core.resources import keep_freed_memory
 from merl.experiments.presets import compose
-from merl.replay import ReplayBuffer
+from merl.replay import ReplayBuffer, ReplaySpec
 from merl.training.loop import Collector, Progress, Randomness, train
 from merl.training.setup import choose_device
 from merl.training.timing import measure, use_threads
@@ -154,7 +154,8 @@ class _Loop:
         stack.callback(environments.close)
         device, frames = choose_device(config.device), config.replay.frame_stack
         count = environments.count
-        replay = ReplayBuffer(config.replay, space, actions, count=count, capacity=CAPACITY)
+        spec = ReplaySpec.of(config.replay, space, actions, capacity=CAPACITY, rings=count)
+        replay = ReplayBuffer(spec)
         modalities = run_spec(config, env).modalities
         stacks = [FrameStack(modalities, frames, device) for _ in range(count)]
         agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)

@@ -163,14 +163,7 @@ class Trainer:
             self._interrupt = stack.enter_context(Interrupt().listening())
             self._metrics = stack.enter_context(MetricsWriter(run.path, self._callbacks.on_warning))
             with torch_settings(setup.device):
-                self.replay = ReplayBuffer(
-                    self.config.replay,
-                    setup.space,
-                    setup.action_space,
-                    count=self.config.num_envs,
-                    directory=run.replay,
-                    capacity=self.config.capacity,
-                )
+                self.replay = ReplayBuffer(setup.replay_spec, run.replay)
             with self._interrupt.raising():
                 self._environments = self._make_environments()
             stack.callback(self._environments.close)
@@ -350,7 +343,7 @@ class Trainer:
     def _is_to_stop(self) -> bool:
         """Return whether a signal, a callback or the time limit stops the run."""
         minutes = self.config.minutes
-        spent = minutes is not None and self._clock.stretch() > minutes * 60
+        spent = minutes is not None and self._clock.seconds_since_start() > minutes * 60
         return spent or self._callback_stops or self._interrupt.number is not None
 
     def _at_episode_end(self) -> None:

@@ -23,7 +23,7 @@ from merl.core import MerlError, is_image
 from merl.core.signals import handlers_kept
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
-from merl.envs.config import OBSERVATIONS, EnvConfig
+from merl.envs.config import OBSERVATIONS, EnvConfig, ObservationKey
 from merl.envs.user_env import make_user_env
 from merl.envs.user_spaces import brief
 
@@ -252,7 +252,7 @@ def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any]
         env.unwrapped.np_random.bit_generator.state = own
 
 
-def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
+def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[ObservationKey, ...]:
     """Return the observations of a Jaco environment that the agent needs.
 
     These are the keys that the agent names; if it names none, those of the config. `state` is used

@@ -69,12 +69,11 @@ class TrainConfig:
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """Task: reach_duplo, move_box, lift_box, the id of a Gymnasium environment, or module:function,
     where the function makes an environment."""
-    preset: str = "paper"
+    preset: tyro.conf.Suppress[str] = "paper"
     """Set of default values for the other options: paper, laptop, state or smoke."""
-    agent_name: Annotated[str, tyro.conf.arg(name="agent", metavar="|".join(AGENTS))] = "merl"
-    """Agent and the observations that it uses. merl: camera and joints; drqv2: camera; proprio:
-    joints; merl_state, ddpg, sac: state."""
-    setting: Setting = "matched"
+    agent_name: tyro.conf.Suppress[str] = "merl"
+    """Name of the agent, which `agent` configures."""
+    setting: tyro.conf.Suppress[Setting] = "matched"
     """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
     (published)."""
     seed: NotNegative = 0

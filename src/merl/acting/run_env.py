@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import warnings
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, SupportsFloat
@@ -26,6 +26,8 @@ from merl.envs.action_repeat import ActionRepeat
 from merl.envs.config import OBSERVATIONS, EnvConfig, ObservationKey
 from merl.envs.user_env import make_user_env
 from merl.envs.user_spaces import brief
+
+_LOG = logging.getLogger(__name__)
 
 
 def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
@@ -95,7 +97,7 @@ class Supervised(gymnasium.Wrapper[Any, Any, Any, Any]):
             with handlers_kept():
                 self.env.close()
         except KeyboardInterrupt:
-            warnings.warn("closing the environment was interrupted", stacklevel=1)
+            _LOG.warning("closing the environment was interrupted")
 
 
 def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Box]:

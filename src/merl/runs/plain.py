@@ -44,7 +44,7 @@ def from_plain(cls: type[T], plain: Mapping[str, Any], **narrower: type) -> T:
 
 def _restore(name: str, hint: Any, value: Any) -> Any:
     """Restore a value; the config itself checks its type (`merl.core.fields`)."""
-    if isinstance(hint, types.UnionType):
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
         if value is None:
             return None
         hint = typing.get_args(hint)[0]

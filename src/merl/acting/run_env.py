@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import warnings
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, SupportsFloat
@@ -23,7 +23,7 @@ from merl.core import Kind, MerlError
 from merl.core.signals import handlers_kept
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
-from merl.envs.config import OBSERVATION_KINDS, EnvConfig
+from merl.envs.config import OBSERVATION_KINDS, EnvConfig, ObservationKey
 from merl.envs.user_env import make_user_env
 from merl.envs.user_spaces import brief
 from merl.modalities import ObservationSpec
@@ -35,6 +35,8 @@ PLURALS: dict[Kind, str] = {
     "sequence": "histories",
 }
 """Kinds of observations in the plural, for people."""
+
+_LOG = logging.getLogger(__name__)
 
 
 def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
@@ -104,7 +106,7 @@ class Supervised(gymnasium.Wrapper[Any, Any, Any, Any]):
             with handlers_kept():
                 self.env.close()
         except KeyboardInterrupt:
-            warnings.warn("closing the environment was interrupted", stacklevel=1)
+            _LOG.warning("closing the environment was interrupted")
 
 
 def run_spec(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> ObservationSpec:
@@ -253,7 +255,7 @@ def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any]
         env.unwrapped.np_random.bit_generator.state = own
 
 
-def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
+def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[ObservationKey, ...]:
     """Return the observations of a Jaco environment that the agent needs.
 
     These are the keys that the agent names; if it names none, those of the config. `state` is used

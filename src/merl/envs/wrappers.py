@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sysconfig
 import traceback
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,6 +43,9 @@ def adapt(
         if not isinstance(getattr(env, name, None), spaces.Space):
             raise MerlError(f"the environment has no {name}: set it to a gymnasium.spaces.Space")
     return Adapted(env, config or UserEnvConfig())
+
+
+_LOG = logging.getLogger(__name__)
 
 
 class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -141,7 +144,7 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
             with failing("close"):
                 self.env.close()
         except MerlError as error:
-            warnings.warn(str(error), stacklevel=1)
+            _LOG.warning("%s", error)
 
     def _scaled(self, action: NDArray[np.float32]) -> NDArray[Any]:
         """Rescale an action from [-1, 1] to the environment's bounds, never beyond them."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ from merl.evaluation.video import MIN_SIDE
 from merl.modalities import modalities_of
 from merl.runs.checkpoint import Checkpoint, load_networks, readable
 from merl.runs.run import Run
+
+_LOG = logging.getLogger(__name__)
 
 
 class Policy:
@@ -105,10 +107,11 @@ class Policy:
         if renderer == "auto" and not self.config.own_env:
             renderer = changes["renderer"] = self.config.env.renderer
         if renderer != self.config.env.renderer and not self.config.own_env:
-            warnings.warn(
-                f"the agent was trained with renderer {self.config.env.renderer!r} but now uses "
-                f"{renderer!r}: their images differ, and the agent may perform worse",
-                stacklevel=2,
+            _LOG.warning(
+                "the agent was trained with renderer %r but now uses %r: their images differ, and "
+                "the agent may perform worse",
+                self.config.env.renderer,
+                renderer,
             )
             changes.setdefault("samples", 1)  # the recorded value is for that renderer
         if self._run is not None:

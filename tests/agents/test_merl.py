@@ -88,7 +88,7 @@ def test_share_of_a_modality_is_rounded_down() -> None:
         ({"frozen_encoders": ("wrist",)}, "agent.frozen-encoders names 'wrist'"),
         (
             {"encoders": {"image": "conv1d"}},
-            "'image': encoder 'conv1d' is not made for .* image: use conv, impala",
+            "'image': encoder 'conv1d' does not fit a key of kind image: choose from conv",
         ),
         ({"encoders": {"proprio": "ident"}}, "'ident' is unknown: did you mean 'identity'"),
         ({"encoder_weights": {"touch": "x"}}, "agent.encoder-weights names 'touch'"),

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -57,13 +57,15 @@ class _First(Choice):
 
 def train(args: list[str]) -> int:
     """Train an agent: merl train TASK [--preset paper|laptop|state|smoke] [--steps N] ..."""
-    first = parse(_First, PROG, args, partial=True)
+    rest: list[str] = []
+    first = parse(_First, PROG, args, rest=rest)
     preset = default_preset() if first.preset is None else first.preset
     composed = partial(compose, preset, agent=first.agent, setting=first.setting)
 
     def options(default: TrainConfig) -> TrainOptions:
         choice = Choice(preset, default.agent_name, first.setting)
-        without_task = dataclasses.replace(default, task=tyro.MISSING)
+        agent = dataclasses.replace(default.agent, **_by_key(rest))
+        without_task = dataclasses.replace(default, task=tyro.MISSING, agent=agent)
         return parse(TrainOptions, PROG, args, default=TrainOptions(choice, without_task))
 
     default, given_open = composed("reach_duplo"), set[str]()
@@ -82,6 +84,20 @@ def train(args: list[str]) -> int:
     why = "CUDA is available" if preset == "paper" else "CUDA is not available"
     reason = why if first.preset is None else "as requested"
     return begin(config, f"preset {preset} ({reason}; {PRESETS[preset].about})")
+
+
+def _by_key(args: list[str]) -> dict[str, Any]:
+    """Return the agent's options for single keys, `--agent.encoders.KEY`, with empty values.
+
+    tyro makes a flag for each key of a default, and the user's environment defines the keys.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for field in ("encoders", "encoder_weights"):
+        start = f"--agent.{field.replace('_', '-')}."
+        keys = [arg.partition("=")[0].removeprefix(start) for arg in args if arg.startswith(start)]
+        if keys:
+            found[field] = dict.fromkeys(keys, "")
+    return found
 
 
 def _refuse_foreign(config: TrainConfig, default: TrainConfig) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from merl.agents import AGENTS
-from merl.agents.config import AgentConfig
+from merl.agents.config import ObservationConfig
 from merl.core import MerlError, check_choice, counted, suggest
 from merl.envs.config import EnvConfig, StartName, UserEnvConfig
 from merl.envs.registration import ENV_IDS
@@ -69,9 +69,11 @@ class TrainConfig:
     where the function makes an environment."""
     preset: str = "paper"
     """Set of default values for the other options: paper, laptop, state or smoke."""
-    agent_name: Annotated[str, tyro.conf.arg(name="agent", metavar="|".join(AGENTS))] = "merl"
+    agent_name: Annotated[
+        str, tyro.conf.arg(name="agent", metavar="|".join([*AGENTS, "MODULE:CLASS"]))
+    ] = "merl"
     """Agent and the observations that it uses. merl: camera and joints; drqv2: camera; proprio:
-    joints; merl_state, ddpg, sac: state."""
+    joints; merl_state, ddpg, sac: state; module:Class: your own."""
     setting: Setting = "matched"
     """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
     (published)."""
@@ -122,13 +124,15 @@ class TrainConfig:
         default_factory=UserEnvConfig
     )
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    agent: AgentConfig = field(default_factory=lambda: AGENTS["merl"])
+    agent: ObservationConfig = field(default_factory=lambda: AGENTS["merl"].config)
     eval: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
-        check_choice("agent", self.agent_name, tuple(AGENTS))
-        kind = type(AGENTS[self.agent_name])
-        if type(self.agent) is not kind:
+        own_agent = ":" in self.agent_name
+        if not own_agent:
+            check_choice("agent", self.agent_name, tuple(AGENTS))
+        kind = ObservationConfig if own_agent else type(AGENTS[self.agent_name].config)
+        if not isinstance(self.agent, kind) or not (own_agent or type(self.agent) is kind):
             raise MerlError(
                 f"agent {self.agent_name!r} needs a config of type {kind.__name__}, not "
                 f"{type(self.agent).__name__}"

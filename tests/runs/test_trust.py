@@ -18,7 +18,8 @@ from gymnasium import spaces
 import merl
 from merl.cli import main
 from merl.core import MerlError
-from merl.envs.user_env import imports_code, load_module, module_folder
+from merl.core.user_code import module_folder
+from merl.envs.user_env import imports_code, load_module
 from merl.runs import trust
 from merl.runs.run import Run
 from merl.runs.trust import Origin

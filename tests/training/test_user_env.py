@@ -163,7 +163,7 @@ def test_merls_own_tasks_use_the_state_only_if_it_is_named() -> None:
         "images used: image (32 x 32 x 3, from 0 to 255)",
         "vectors used: proprio (24 numbers)",
     ]
-    assert AGENTS["ddpg"].vectors == compose("smoke", "reach_duplo", "ddpg").agent.vectors
+    assert AGENTS["ddpg"].config.vectors == compose("smoke", "reach_duplo", "ddpg").agent.vectors
 
 
 def test_a_run_prints_its_keys_and_resumes_with_them(

@@ -1,11 +1,11 @@
-"""Config of an agent: its networks and how it learns. Each agent is a choice of these values."""
+"""Config of an agent: the keys that it observes, its networks, and how it learns."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal, get_args
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
 
 from merl.core import MerlError, check_choice
 from merl.networks.fusion import Squash
@@ -22,8 +22,8 @@ WIDEST = 65_536
 
 
 @dataclass(frozen=True)
-class AgentConfig:
-    """Networks of an agent and how it learns; the defaults are from Table 1 and Appendix C.1."""
+class ObservationConfig:
+    """Base of every agent's config: the keys that it observes."""
 
     images: tuple[str, ...] | None = None
     """Image keys to use; if not set, every image that the environment gives."""
@@ -33,6 +33,23 @@ class AgentConfig:
     privileged: tuple[str, ...] = ()
     """Vector keys that only the critic observes, e.g. `state`: known in training only (asymmetric
     critic)."""
+
+
+@dataclass(frozen=True)
+class UnloadedConfig(ObservationConfig):
+    """Config of a user's agent, as recorded in a run, before the agent's code is imported."""
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    """Every recorded value, by name."""
+
+
+@dataclass(frozen=True)
+class AgentConfig(ObservationConfig):
+    """Networks of an agent and how it learns; the defaults are from Table 1 and Appendix C.1.
+
+    Each agent of merl is a choice of these values.
+    """
+
     learning_rate: float = 1e-4
     """Step size of Adam, for every network."""
     learning_rate_end: float | None = None
@@ -144,6 +161,11 @@ class AgentConfig:
                     f"not {getattr(self, name)}"
                 )
         self._check_histogram()
+        if self.privileged and self.fusion != "decoupled":
+            raise MerlError(
+                f"agent.privileged {self.privileged} needs separate fusions for critic and actor: "
+                f"use --agent.fusion decoupled instead of {self.fusion}"
+            )
         for name in ("fusion", "fusion_norm", "squash"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):
                 raise MerlError(

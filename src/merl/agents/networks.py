@@ -10,7 +10,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from merl.agents.config import AgentConfig
+from merl.agents.config import AgentConfig, ObservationConfig
 from merl.core import MerlError, is_image, is_vector
 from merl.networks.critic import TwinCritic
 from merl.networks.encoders import ConvEncoder, VectorEncoder
@@ -139,7 +139,9 @@ def make_networks(
     return networks
 
 
-def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def modalities(
+    config: ObservationConfig, space: spaces.Dict
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the image keys and the vector keys that the actor uses, checked against the space.
 
     Raises:
@@ -165,11 +167,11 @@ def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...]
     return images, vectors
 
 
-def privileged_keys(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
+def privileged_keys(config: ObservationConfig, space: spaces.Dict) -> tuple[str, ...]:
     """Return the vector keys that only the critic observes.
 
     Raises:
-        MerlError: a key is missing, the actor uses it too, or the fusion is shared.
+        MerlError: a key is missing, or the actor uses it too.
     """
     given = [k for k, s in space.items() if is_vector(s)]
     keys = _keys("privileged", config.privileged, given)
@@ -180,11 +182,6 @@ def privileged_keys(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
                 f"agent.privileged names {key!r}, which the actor uses too: remove it from "
                 "--agent.privileged or from --agent.vectors"
             )
-    if keys and config.fusion != "decoupled":
-        raise MerlError(
-            f"agent.privileged {keys} needs separate fusions for critic and actor: use "
-            f"--agent.fusion decoupled instead of {config.fusion}"
-        )
     return keys
 
 

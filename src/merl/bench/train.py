@@ -16,11 +16,13 @@ from typing import Any
 import torch
 from rich.table import Table
 
+from merl.accelerate.networks import speed_up
 from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack
 from merl.acting.run_env import make_run_env, run_spaces
 from merl.acting.workers import WorkerEnvs
 from merl.agents import make_agent
+from merl.agents.config import AgentConfig
 from merl.bench.measuring import Side, circumstances, shown, spread
 from merl.config import TrainConfig
 from merl.core import counted, is_image
@@ -63,6 +65,7 @@ def run(
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "task": task, "preset": preset}
     result |= circumstances()
     rates, config = steps_per_second(_sides(), task, preset, repeats, steps)
+    assert isinstance(config.agent, AgentConfig)
     result |= {
         "precision": config.agent.precision,
         "compiled": config.agent.torch_compile == "yes",
@@ -157,11 +160,20 @@ class _Loop:
         count = environments.count
         replay = ReplayBuffer(config.replay, space, actions, count=count, capacity=CAPACITY)
         stacks = [FrameStack(frames, images, device) for _ in range(count)]
-        agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)
+        agent = make_agent(
+            config.agent_name,
+            config.agent,
+            space,
+            actions,
+            frame_stack=frames,
+            seed=0,
+            device=device,
+        )
+        speed_up(agent)
         self._progress = Progress()
         collector = Collector(environments, replay, stacks)
         randomness = Randomness(config.seed)
-        update = make_update(agent, replay, randomness, config, lambda _: None)
+        update = make_update(agent, replay, randomness, config, device, lambda _: None)
         self._results = train(collector, agent, update, self._progress, randomness, config)
 
     def rate(self, steps: int) -> float:

@@ -58,7 +58,10 @@ def train(args: list[str]) -> int:
         if (config.run_dir / CONFIG_FILE).exists():
             closed = decided(compose(preset, task, agent, setting))
             given_open = {*left_open(_parse(args, closed).config)} - {*left_open(closed)}
-            return go_on(Run.open(config.run_dir), config, given_open, named_in=Path.cwd())
+            run = Run.open(config.run_dir)
+            if run.config.agent_name == config.agent_name:  # otherwise `go_on` refuses
+                run = run.with_agent(named_in=Path.cwd())
+            return go_on(run, config, given_open, named_in=Path.cwd())
     return begin(config, f"preset {preset} ({why}; {PRESETS[preset].about})")
 
 

@@ -14,12 +14,15 @@ from merl.core.errors import (
 from merl.core.types import (
     CONFIG_FILE,
     METRICS_FILE,
+    Accelerable,
     Agent,
     Batch,
     FrameTransform,
     FrameTransforms,
     Observation,
     Transition,
+    UpdateNoise,
+    UpdatePlan,
     is_image,
     is_vector,
 )
@@ -27,6 +30,7 @@ from merl.core.types import (
 __all__ = [
     "CONFIG_FILE",
     "METRICS_FILE",
+    "Accelerable",
     "Agent",
     "Batch",
     "EnvironmentFailed",
@@ -39,6 +43,8 @@ __all__ = [
     "NotSaved",
     "Observation",
     "Transition",
+    "UpdateNoise",
+    "UpdatePlan",
     "check_choice",
     "counted",
     "is_image",

@@ -49,7 +49,9 @@ _NAMES = ("run_dir", "preset", "setting")
 def left_open(config: TrainConfig) -> tuple[str, ...]:
     """Return the names of the fields that a config leaves open."""
     values = dict(_flat(config))
-    return tuple(name for name, value in _LEFT_OPEN.items() if values[name] == value)
+    return tuple(
+        name for name, value in _LEFT_OPEN.items() if name in values and values[name] == value
+    )
 
 
 def reopened(config: TrainConfig, names: Iterable[str] = REOPENED) -> TrainConfig:
@@ -129,7 +131,10 @@ def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _replaced(config: Any, name: str, value: Any) -> Any:
+    """Return a config with another value of a field, if it has the field."""
     first, _, rest = name.partition(".")
+    if not hasattr(config, first):  # the config of a user's agent
+        return config
     if rest:
         value = _replaced(getattr(config, first), rest, value)
     return dataclasses.replace(config, **{first: value})

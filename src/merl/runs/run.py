@@ -26,13 +26,15 @@ import numpy as np
 from gymnasium import spaces
 
 import merl
-from merl.agents import AGENTS
+from merl.agents import AGENTS, find_agent
+from merl.agents.config import ObservationConfig, UnloadedConfig
 from merl.agents.networks import modalities
 from merl.config import TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, check_choice
+from merl.core.user_code import module_folder
 from merl.envs.config import AUTO_RENDERER, check_not_removed
 from merl.envs.registration import ENV_IDS
-from merl.envs.user_env import imports_code, load_module, module_folder
+from merl.envs.user_env import imports_code, load_module
 from merl.runs import trust
 from merl.runs.plain import box, describe, from_plain, to_plain, told
 from merl.runs.provenance import commit, machine, package_versions
@@ -121,6 +123,7 @@ class Run:
                     "config": to_plain(config),
                     "left_open": list(left_open),
                     "module_folder": _module_folder(config.task),
+                    "agent_folder": _module_folder(config.agent_name),
                     "observation_space": {k: describe(s) for k, s in observation_space.items()},
                     "action_space": describe(action_space) | {"own_bounds": bounds},
                     "versions": package_versions(),
@@ -137,6 +140,8 @@ class Run:
     @classmethod
     def open(cls, path: Path) -> Run:
         """Open an existing run without importing or executing any code of it.
+
+        The config of a user's own agent is an `UnloadedConfig` until `with_agent`.
 
         Raises:
             MerlError: the folder is not a run, or its config cannot be read.
@@ -172,22 +177,52 @@ class Run:
         """
         if not imports_code(self.config.task):
             return
+        origin = self._trusted_origin(trusted, named_in)
+        if ":" in self.config.task:
+            load_module(self.config.task, *_folders(origin.folder if origin else None, named_in))
+
+    def with_agent(self, *, trusted: bool = False, named_in: Path | None = None) -> Run:
+        """Import the module of a user's own agent; return the run with the agent's config.
+
+        Args:
+            trusted: see `load_module`.
+            named_in: a folder that may contain the module as well, because the user named the agent
+                there; this also allows the import.
+
+        Raises:
+            MerlError: the import is not allowed (`trust.check`), it fails, or the class of the
+                agent's config does not accept the recorded values.
+        """
+        agent, name = self.config.agent, self.config.agent_name
+        if not isinstance(agent, UnloadedConfig):
+            return self
+        origin = self._trusted_origin(trusted, named_in)
+        folders = _folders(origin.agent_folder if origin else None, named_in)
+        found = find_agent(name, *folders)
+        with _readable(self.path):
+            loaded = from_plain(type(found.config), agent.values)
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, agent=loaded))
+
+    def _trusted_origin(self, trusted: bool, named_in: Path | None) -> Origin | None:
+        """Return the origin whose import is allowed; None: only the module that the user named.
+
+        Raises:
+            MerlError: the import is not allowed.
+        """
         record = _read(self.path)
-        folder: str | None = None
         try:
-            folder = trust.check(self.path, record).folder
+            return trust.check(self.path, record)
         except MerlError:
             if trusted:
-                folder = trust.origin(record).folder
-            elif named_in is None:
+                return trust.origin(record)
+            if named_in is None:
                 raise
-        if ":" in self.config.task:
-            folders = [Path(folder) if folder is not None else None, named_in]
-            load_module(self.config.task, *(each for each in folders if each is not None))
+        return None
 
     def origin(self) -> Origin | None:
-        """Return the origin of the environment's code; None for merl's and Gymnasium's own."""
-        return trust.origin(_read(self.path)) if imports_code(self.config.task) else None
+        """Return the origin of the code that the run imports; None if it is merl's own."""
+        origin = trust.origin(_read(self.path))
+        return origin if origin.code() else None
 
     def record_resumption(self, step: int) -> None:
         """Record that the run resumes at `step`: its current config, versions and machine."""
@@ -195,6 +230,7 @@ class Run:
         record["config"] = to_plain(self.config)
         record["left_open"] = list(self.left_open)
         record["module_folder"] = _module_folder(self.config.task)
+        record["agent_folder"] = _module_folder(self.config.agent_name)
         record["id"] = trust.identity(record.get("id"))
         record.setdefault("resumed", []).append(
             {
@@ -316,8 +352,14 @@ class Run:
 def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
     """Restore the config of a run; the agent's name selects the class of the agent config."""
     name = plain.get("agent_name", "merl")
+    if isinstance(name, str) and ":" in name:
+        values = plain["agent"]
+        keys = {f.name: values[f.name] for f in dataclasses.fields(ObservationConfig)}
+        return from_plain(
+            TrainConfig, {**plain, "agent": {**keys, "values": values}}, agent=UnloadedConfig
+        )
     check_choice("agent", name, tuple(AGENTS))
-    return from_plain(TrainConfig, plain, agent=type(AGENTS[name]))
+    return from_plain(TrainConfig, plain, agent=type(AGENTS[name].config))
 
 
 def _updated(plain: Mapping[str, Any], space: spaces.Dict) -> Mapping[str, Any]:
@@ -402,6 +444,10 @@ def _recorded_spaces(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box
     return spaces.Dict(observation), box(record["action_space"])
 
 
-def _module_folder(task: str) -> str | None:
-    folder = module_folder(task)
+def _module_folder(named: str) -> str | None:
+    folder = module_folder(named)
     return None if folder is None else str(folder)
+
+
+def _folders(*folders: str | Path | None) -> list[Path]:
+    return [Path(folder) for folder in folders if folder is not None]

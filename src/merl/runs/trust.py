@@ -1,10 +1,10 @@
-"""Records of the runs that this user has trained: only their environments may be imported.
+"""Records of the runs that this user has trained: only their code may be imported.
 
-A run folder can come from anyone, and importing the environment that it names would run code. An
-environment of merl or Gymnasium is always allowed. Any other environment is imported only if a
-record outside of the run folder shows that this user trained the run. The record is a file whose
-name is the random id of the run; it holds the task and the folder of its module. The task and
-folder in `config.json` are not trusted.
+A run folder can come from anyone, and importing the environment or the agent that it names would
+run code. Those of merl and Gymnasium are always allowed. Others are imported only if a record
+outside of the run folder shows that this user trained the run. The record is a file whose name is
+the random id of the run; it holds the names and the folders of their modules. The names and folders
+in `config.json` are not trusted.
 """
 
 from __future__ import annotations
@@ -28,23 +28,36 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Origin:
-    """The origin of the environment of a run.
+    """The origin of the environment and the agent of a run.
 
     Attributes:
         task: `module:function` or `module:Id-v0`, or the id of a Gymnasium environment.
-        folder: the folder of the module; None if the module is installed.
+        folder: the folder of its module; None if the module is installed.
+        agent: `module:Class`, or the name of one of merl's agents.
+        agent_folder: the folder of its module; None if the module is installed.
     """
 
     task: str
     folder: str | None
+    agent: str = "merl"
+    agent_folder: str | None = None
+
+    def code(self) -> dict[str, str]:
+        """Describe the code that would be imported, with control characters escaped.
+
+        Returns:
+            Descriptions by "environment" and "agent"; none of these if it is merl's or Gymnasium's.
+        """
+        described = {}
+        if imports_code(self.task):
+            described["environment"] = _describe(self.task, self.folder)
+        if ":" in self.agent:
+            described["agent"] = _describe(self.agent, self.agent_folder)
+        return described
 
     def __str__(self) -> str:
-        """Describe the code that would be imported, with control characters escaped."""
-        module, colon, name = self.task.partition(":")
-        if not colon:
-            return f"Gymnasium environment {self.task!r}"
-        where = "installed" if self.folder is None else f"in folder {self.folder!r}"
-        return f"{name!r} of module {module!r}, {where}"
+        """Return the descriptions of `code`."""
+        return " and ".join(self.code().values())
 
 
 def identity(known: Any = None) -> str:
@@ -53,19 +66,23 @@ def identity(known: Any = None) -> str:
 
 
 def origin(record: Mapping[str, Any]) -> Origin:
-    """Read the origin of the environment from the record of a run (`config.json`).
+    """Read the origin of environment and agent from the record of a run (`config.json`).
 
     Raises:
-        TypeError: task or folder is not a string.
+        TypeError: a name or a folder is not a string.
     """
-    task, folder = record["config"]["task"], record.get("module_folder")
-    if not isinstance(task, str) or not isinstance(folder, str | None):
-        raise TypeError(f"task is {task!r} and module_folder {folder!r}")
-    return Origin(task, folder)
+    config = record["config"]
+    task, agent = config["task"], config.get("agent_name", "merl")
+    folder, agent_folder = record.get("module_folder"), record.get("agent_folder")
+    if not (isinstance(task, str) and isinstance(agent, str)):
+        raise TypeError(f"task is {task!r} and agent_name {agent!r}")
+    if not (isinstance(folder, str | None) and isinstance(agent_folder, str | None)):
+        raise TypeError(f"module_folder is {folder!r} and agent_folder {agent_folder!r}")
+    return Origin(task, folder, agent, agent_folder)
 
 
 def remember(record: Mapping[str, Any]) -> None:
-    """Record that this user trains a run, if its environment imports code.
+    """Record that this user trains a run, if its environment or its agent imports code.
 
     If the record cannot be written, log a warning.
 
@@ -73,7 +90,7 @@ def remember(record: Mapping[str, Any]) -> None:
         record: the content of the run's `config.json`.
     """
     stated, name = origin(record), record["id"]
-    if not imports_code(stated.task):
+    if not stated.code():
         return
     try:
         folder = _folder()
@@ -97,7 +114,7 @@ def check(run: Path, record: Mapping[str, Any]) -> Origin:
         record: the content of its `config.json`.
 
     Raises:
-        MerlError: this user has no record of the run, or the record names another environment.
+        MerlError: this user has no record of the run, or the record names other code.
     """
     stated = origin(record)
     try:
@@ -105,15 +122,23 @@ def check(run: Path, record: Mapping[str, Any]) -> Origin:
     except OSError as error:
         reason = f"your records of runs cannot be read ({error})"
     else:
-        if recorded is not None and recorded.task == stated.task:
+        if recorded is not None and (recorded.task, recorded.agent) == (stated.task, stated.agent):
             return recorded
         reason = "you have no record of training it here"
         if recorded is not None:
             reason = f"you trained it with {recorded}, and its config.json was changed since then"
     raise MerlError(
-        f"{run} names code as its environment: {stated}. It is not imported, because {reason}: "
-        "read that code, then add --trust (in Python: make_env(trust=True))"
+        f"{run} names code as its {' and '.join(stated.code())}: {stated}. It is not imported, "
+        f"because {reason}: read that code, then add --trust (in Python: trust=True)"
     )
+
+
+def _describe(named: str, folder: str | None) -> str:
+    module, colon, name = named.partition(":")
+    if not colon:
+        return f"Gymnasium environment {named!r}"
+    where = "installed" if folder is None else f"in folder {folder!r}"
+    return f"{name!r} of module {module!r}, {where}"
 
 
 def _is_identity(value: Any) -> bool:

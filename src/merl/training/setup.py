@@ -14,14 +14,14 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
+from merl.accelerate.networks import speed_up
 from merl.acting.env_checks import check_instances
 from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces
 from merl.agents import make_agent
-from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG
+from merl.agents.config import AgentConfig, ObservationConfig
 from merl.agents.networks import make_networks
 from merl.config import TrainConfig
-from merl.core import MerlError, counted
+from merl.core import Agent, MerlError, counted
 from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.user_env import load_module
 from merl.evaluation.video import MIN_SIDE
@@ -81,7 +81,8 @@ class Setup:
             agent=bounded(best.decided(config.agent), config.replay.discount),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
-        self.agent: DDPG = make_agent(
+        self.agent: Agent = make_agent(
+            config.agent_name,
             self.config.agent,
             self.space,
             self.action_space,
@@ -90,6 +91,7 @@ class Setup:
             device=self.device,
             threads=best.threads,
         )
+        speed_up(self.agent)
 
     @classmethod
     @contextmanager
@@ -144,13 +146,15 @@ class Setup:
             yield cls(config, env, eval_env, home)
 
 
-def bounded(agent: AgentConfig, discount: float) -> AgentConfig:
+def bounded(agent: ObservationConfig, discount: float) -> ObservationConfig:
     """Return the config with a value of `critic_high`, if its critic predicts a histogram.
 
     Raises:
         MerlError: the discount gives no bound of the returns, or one that is not above
             `critic_low`.
     """
+    if not isinstance(agent, AgentConfig):
+        return agent
     if agent.critic_loss == "mse" or agent.critic_high is not None:
         return agent
     if discount == 1.0:
@@ -191,11 +195,13 @@ def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.B
     Raises:
         MerlError: the networks or the batch are too large.
     """
-    with torch.device("meta"):
-        networks = make_networks(
-            config.agent, space, action_space.shape[0], config.replay.frame_stack
-        )
-    weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
+    weights = 0
+    if isinstance(config.agent, AgentConfig):
+        with torch.device("meta"):
+            networks = make_networks(
+                config.agent, space, action_space.shape[0], config.replay.frame_stack
+            )
+        weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
     stack, size = config.replay.frame_stack, config.replay.batch_size
     inputs = 2 * 5 * size * sum(math.prod(s.shape or ()) * stack for s in space.values())
     available = available_memory()

@@ -284,6 +284,7 @@ class Trainer:
             self.replay,
             setup.randomness,
             self.config,
+            setup.device,
             self._callbacks.on_warning,
             setup.progress.updates,
         )

@@ -26,7 +26,7 @@ def bytes_on_device(rings: Sequence[EpisodeRing]) -> int:
     return sum(array.nbytes for ring in rings for array in ring.arrays().values())
 
 
-class OnDevice:
+class DeviceReplay:
     """Copy, on a device, of rings with the same spaces, one after the other.
 
     Args:

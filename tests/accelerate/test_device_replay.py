@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_replay import Account, Episode, Every, make, write
 
+from merl.accelerate.device_replay import CHUNK, DeviceReplay, bytes_on_device
 from merl.core import Batch
 from merl.replay import EpisodeRing
-from merl.replay.on_device import CHUNK, OnDevice, bytes_on_device
 
 EPISODES = st.builds(Episode, st.integers(1, 9), st.sampled_from(["end", "limit", "cut"]))
 
@@ -35,7 +35,7 @@ def tensors(batch: Batch) -> dict[str, torch.Tensor]:
     return observations | rest
 
 
-def check(copy: OnDevice, rings: list[EpisodeRing]) -> None:
+def check(copy: DeviceReplay, rings: list[EpisodeRing]) -> None:
     """Compare every step of every ring in the copy with the ring itself."""
     for number, ring in enumerate(rings):
         if not len(ring):
@@ -54,7 +54,7 @@ def test_copy_gives_the_same_samples_as_the_rings(
 ) -> None:
     stack, n_step = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 4))
     rings = [make(frame_stack=stack, n_step=n_step) for _ in plans]
-    copy = OnDevice(rings, torch.device("cpu"))
+    copy = DeviceReplay(rings, torch.device("cpu"))
     writers = [
         writing(ring, number, plan)
         for number, (ring, plan) in enumerate(zip(rings, plans, strict=True))
@@ -77,7 +77,7 @@ def test_many_new_slots_are_copied_in_chunks() -> None:
     rings = [make(capacity=3 * CHUNK)]
     for _ in writing(rings[0], 0, [Episode(50, "limit")] * 300):
         pass
-    copy = OnDevice(rings, torch.device("cpu"))
+    copy = DeviceReplay(rings, torch.device("cpu"))
     copy.follow()
     check(copy, rings)
     assert bytes_on_device(rings) > 3 * CHUNK * 36
@@ -88,7 +88,7 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
     for number, (ring, lengths) in enumerate(zip(rings, ([7, 40], [5]), strict=True)):
         for _ in writing(ring, number, [Episode(length, "limit") for length in lengths]):
             pass
-    copy = OnDevice(rings, torch.device("cpu"))
+    copy = DeviceReplay(rings, torch.device("cpu"))
     copy.follow()
     count = 25 * 2000
     batch = copy.sample(count, torch.Generator().manual_seed(0))
@@ -103,7 +103,7 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
 def test_uninitialised_memory_does_not_reach_a_batch() -> None:
     """The copy's memory on a GPU is not initialised, and may hold NaN."""
     ring = make(capacity=50)
-    copy = OnDevice([ring], torch.device("cpu"))
+    copy = DeviceReplay([ring], torch.device("cpu"))
     for field in copy._fields.values():
         if field.is_floating_point():
             field.fill_(torch.nan)
@@ -117,7 +117,7 @@ def test_sampling_does_not_wait_for_the_device(monkeypatch: pytest.MonkeyPatch) 
     ring, device, rand = make(capacity=20), torch.device("meta"), torch.rand
     for _ in writing(ring, 0, [Episode(30, "limit")]):
         pass
-    copy = OnDevice([ring], device)
+    copy = DeviceReplay([ring], device)
     copy.follow()
     monkeypatch.setattr(torch, "rand", lambda *a, generator, **k: rand(*a, **k))
     drawn = tensors(copy.sample(5, torch.Generator()))
@@ -137,7 +137,7 @@ def test_rings_of_different_lengths_after_growth(tmp_path: Path) -> None:
         rings.append(make(tmp_path / str(number), capacity=30))
     lengths = [ring.ring_index.length for ring in rings]
     assert len(set(lengths)) == 2
-    copy = OnDevice(rings, torch.device("cpu"))
+    copy = DeviceReplay(rings, torch.device("cpu"))
     for episode in range(6):
         copy.follow()
         check(copy, rings)

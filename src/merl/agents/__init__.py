@@ -27,7 +27,7 @@ class AgentKind:
 
     Attributes:
         config: its default config.
-        make: makes the agent: its class, called with the arguments of `DDPG`.
+        make: makes the agent: its class, called with the arguments of `make_agent`.
     """
 
     config: ObservationConfig
@@ -62,8 +62,7 @@ def find_agent(name: str, *folders: Path) -> AgentKind:
     if ":" not in name:
         check_choice("agent", name, tuple(AGENTS))
         return AGENTS[name]
-    form = "module:Class, for example my_agent:MyAgent for my_agent.py"
-    module = load_module(name, *folders, kind="agent", form=form)
+    module = load_module(name, *folders, kind="agent")
     _, _, class_name = name.partition(":")
     found = getattr(module, class_name, None)
     if not isinstance(found, type):

@@ -48,21 +48,11 @@ class DDPGConfig(AgentConfig):
 class DDPG:
     """Off-policy actor-critic of the paper.
 
-    Args:
-        config: networks, and how to learn; `precision` "auto" means fp32 here.
-        observation_space: observations of the environment, with the keys that the agent uses.
-        action_space: actions of the environment, (A,), in [-1, 1].
-        frame_stack: number of frames in an image stack.
-        seed: seed of the noise and the shifts; `make_agent` seeds the weights.
-        device: device of the networks, the optimizers and the random generators.
-        threads: CPU threads of acting and updates; None keeps torch's setting.
+    The arguments are those of `merl.agents.make_agent`, which also seeds the initial weights. In
+    the config, `precision` "auto" means fp32 here.
 
     Attributes:
         updates: critic updates so far; they determine when the actor is updated.
-
-    Raises:
-        MerlError: the observation space lacks a key that the config names, or the config does not
-            fit the space.
     """
 
     actor_class: ClassVar[type[Actor] | type[GaussianActor]] = Actor

@@ -17,8 +17,7 @@ import tyro
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG
+from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.optimizers import adam, load_optimizer, step_optimizer
 from merl.core import MerlError, UpdatePlan
 from merl.networks.heads import Actor, GaussianActor
@@ -26,17 +25,9 @@ from merl.networks.settings import with_torch_settings
 
 
 @dataclass(frozen=True)
-class SACConfig(AgentConfig):
+class SACConfig(DDPGConfig):
     """SAC on the state, with a learnt temperature (Haarnoja et al. 2018b)."""
 
-    images: tuple[str, ...] | None = ()
-    """Image keys to use: none."""
-    vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to use."""
-    latent_dim: int = 0
-    """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
-    head_norm: bool = False
-    """LayerNorm in the hidden layers of actor and critic."""
     temperature: float = 1.0
     """Initial value of alpha."""
     target_entropy: float | None = None

@@ -31,7 +31,7 @@ from merl.experiments.presets import compose
 from merl.replay import ReplayBuffer
 from merl.training.loop import Collector, Progress, Randomness, train
 from merl.training.setup import choose_device
-from merl.training.timing import measure, use_threads
+from merl.training.timing import measure
 from merl.training.updating import make_update
 
 STRICT = "strict: one environment, in turn with the learner"
@@ -100,7 +100,7 @@ def steps_per_second(
         best = measure(config, env, env, space, choose_device(config.device)).best
         agent = best.decided(config.agent)
         config = dataclasses.replace(config, agent=agent, threads=best.threads)
-        use_threads(best.threads)
+        torch.set_num_threads(best.threads)
         keep_freed_memory()
         stack.callback(keep_freed_memory, False)
         loops = {

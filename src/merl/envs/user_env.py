@@ -69,13 +69,7 @@ def load_module(task: str, *folders: Path) -> ModuleType:
     if task in BUNDLED:
         return importlib.import_module(task.partition(":")[0])
     module, _, name = task.partition(":")
-    return user_code.load_module(
-        task,
-        *folders,
-        kind="task",
-        form="module:function, for example my_robot:make_env for my_robot.py",
-        advice=installing(name, module),
-    )
+    return user_code.load_module(task, *folders, advice=installing(name, module))
 
 
 def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:

@@ -29,7 +29,7 @@ from merl.replay import check_fits
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
 from merl.training.loop import Progress, Randomness
-from merl.training.timing import measure, use_threads
+from merl.training.timing import measure
 
 
 class Setup:
@@ -73,7 +73,7 @@ class Setup:
         self.left_open = left_open(config)
         self.timing = measure(timed, env, eval_env or env, self.space, self.device)
         best = self.timing.best
-        use_threads(best.threads)
+        torch.set_num_threads(best.threads)
         self.config = dataclasses.replace(
             config,
             threads=best.threads,

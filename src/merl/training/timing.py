@@ -151,7 +151,7 @@ def measure(
     update: dict[Arithmetic, float] = {}
 
     def attempt(arithmetic: Arithmetic) -> Agent:
-        use_threads(arithmetic.threads)
+        torch.set_num_threads(arithmetic.threads)
         try:
             with torch_settings(device):
                 agent = _agent(config, space, batch, device, arithmetic)
@@ -167,7 +167,7 @@ def measure(
     fastest = Timing(update, 0.0).best
     if config.threads is None and cores > threads:
         attempt(dataclasses.replace(fastest, threads=cores))
-    use_threads(threads)
+    torch.set_num_threads(threads)
     with torch_settings(device):
         step, frame = _time_acting(agent, batch, device), 0.0
     knows_env = config.measure or not config.own_env
@@ -194,11 +194,6 @@ def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -
     agent = config.agent
     left_open = isinstance(agent, AgentConfig) and agent.torch_compile == "auto"
     return left_open and device.type == "cuda" and timing.seconds(config) > WORTH_COMPILING
-
-
-def use_threads(count: int) -> None:
-    """Use `count` processor threads in this process."""
-    torch.set_num_threads(count)
 
 
 def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:

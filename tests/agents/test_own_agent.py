@@ -174,7 +174,11 @@ def test_the_agent_of_an_untrusted_run_is_not_imported(
         ),
         (NAME, (", threads\n", "\n"), "got an unexpected keyword argument 'threads': docs/howto"),
         (NAME, ("(ObservationConfig)", ""), "Config must be a dataclass that extends Observation"),
-        (NAME, ("hidden: int = 64", "hidden: int"), "missing 1 required positional argument"),
+        (
+            NAME,
+            ("hidden: int = 64", "hidden: int"),
+            "TypeError: non-default argument 'hidden' follows",
+        ),
         (NAME, ("tuple(observation_space)", '("eye",)'), "senses is ('eye',): return a tuple of"),
         (NAME, (".to(device)", ".to(devise)"), "cannot be made: NameError: name 'devise' is not"),
         (NAME, ("action.clamp(-1, 1)", "action[0]"), "returned shape (2,): return (1, 2), one"),

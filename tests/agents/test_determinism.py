@@ -17,7 +17,12 @@ from merl.core import UpdateNoise
 CASE = Case(
     "small",
     MERLConfig(
-        latent_dim=32, conv_channels=8, hidden_dim=32, vector_encoder_dim=8, precision="fp32"
+        latent_dim=32,
+        conv_channels=8,
+        hidden_dim=32,
+        encoders={"proprio": "mlp"},
+        mlp_dim=8,
+        precision="fp32",
     ),
 )
 

@@ -75,16 +75,16 @@ def train(*flags: str, agent: str = NAME, run: str = "run") -> int:
 def test_it_trains_evaluates_and_resumes_exactly(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert train("--agent.images") == 0
+    assert train("--agent.keys", "joints") == 0
     config = Run.open(folder / "run").with_agent().config
-    assert (config.agent_name, config.agent.hidden, config.agent.images) == (NAME, 16, ())  # type: ignore[attr-defined]
+    assert (config.agent_name, config.agent.hidden, config.agent.keys) == (NAME, 16, ("joints",))  # type: ignore[attr-defined]
 
     class Stops(merl.Callback):
         def on_step(self, result: StepResult) -> bool | None:
             return False if result.step == 40 else None
 
     forget()
-    values = VALUES | {"run_dir": "again", "agent.images": ()}
+    values = VALUES | {"run_dir": "again", "agent.keys": ("joints",)}
     merl.train(TASK, agent=NAME, callbacks=[Stops()], **values)
     forget()
     monkeypatch.chdir(Path(sys.executable).parent)  # the record of the run names the folder

@@ -149,7 +149,7 @@ class WorkerEnvs:
         folder, config = module_folder(self._config.task), self._config
         if ":" in config.agent_name:  # a worker does not need the user's class of config
             agent = config.agent
-            keys = ObservationConfig(agent.images, agent.vectors, agent.privileged)
+            keys = ObservationConfig(agent.keys, agent.modalities, agent.privileged)
             config = replace(config, agent=keys)
         makers = [
             _Maker(config, index, expected, self._here, folder) for index in range(self.count)

@@ -15,6 +15,7 @@ from merl.agents.config import ObservationConfig
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
+from merl.agents.networks import load_encoder_weights
 from merl.agents.sac import SAC, SACConfig
 from merl.core import Agent, MerlError, check_choice, suggest
 from merl.core.user_code import in_one_line, load_module
@@ -40,8 +41,8 @@ AGENTS = {
     "ddpg": AgentKind(DDPGConfig(), DDPG),
     "sac": AgentKind(SACConfig(), SAC),
     # Two baselines of the paper's argument: proprioception alone, and MERL on the state.
-    "proprio": AgentKind(MERLConfig(images=()), DDPG),
-    "merl_state": AgentKind(MERLConfig(images=(), vectors=("state",)), DDPG),
+    "proprio": AgentKind(MERLConfig(modalities=("vector", "sequence")), DDPG),
+    "merl_state": AgentKind(MERLConfig(keys=("state",)), DDPG),
 }
 """The agents of merl."""
 METHODS = ("act", "update", "state_dict", "load_state_dict", "load_policy")
@@ -125,6 +126,15 @@ def make_agent(
         keys = tuple(observation_space)
         raise MerlError(f"agent {name!r}: senses is {senses!r}: return a tuple of keys of {keys}")
     return agent
+
+
+def load_initial_weights(agent: Agent, home: Path) -> None:
+    """Load the weights of encoders that the config names, into an agent that starts to train.
+
+    Arguments and exceptions are those of `load_encoder_weights`.
+    """
+    if isinstance(agent, DDPG):
+        load_encoder_weights(agent.networks, agent.config, home)
 
 
 def _default_config(name: str, found: type[Any]) -> ObservationConfig:

@@ -35,10 +35,8 @@ from merl.networks.settings import with_torch_settings
 class DDPGConfig(AgentConfig):
     """DDPG on the state, with clipped double Q (Fujimoto et al. 2018) and 3-step returns."""
 
-    images: tuple[str, ...] | None = ()
-    """Image keys to use: none."""
-    vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to use."""
+    keys: tuple[str, ...] | None = ("state",)
+    """Observation keys to use."""
     latent_dim: int = 0
     """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
     head_norm: bool = False
@@ -78,7 +76,7 @@ class DDPG:
         # The target uses the newest fusion, unless the config gives the fusion a target too.
         self.critic_target = nn.ModuleDict(copy.deepcopy(self._averaged())).requires_grad_(False)
         parts = networks.encoders, networks.critic_fusion, networks.critic
-        self.critic_parameters = [parameter for part in parts for parameter in part.parameters()]
+        self.critic_parameters = [p for part in parts for p in part.parameters() if p.requires_grad]
         self.actor_parameters = [*self._actors_fusion(), *networks.actor.parameters()]
         self.critic_optimizer = adam(self.critic_parameters, config.learning_rate)
         self.actor_optimizer = adam(self.actor_parameters, config.learning_rate)
@@ -102,7 +100,7 @@ class DDPG:
         The noise is not clipped.
 
         Args:
-            observation: images uint8 (B, K, H, W, C), vectors float32 (B, n), on the device.
+            observation: as in `Batch`, on the device.
             explore: add the noise; if False, the averaged actor acts, if there is one.
             step: environment steps so far, on which sigma may depend.
 
@@ -232,7 +230,7 @@ class DDPG:
         """Draw the random numbers of an update with a batch of `size` samples."""
         generator = self.learning
         pad, shape = self.networks.encoders.pad, (size, self.networks.actor.action_dim)
-        keys = self.networks.encoders.image_keys if pad else ()
+        keys = self.networks.encoders.shifted
         shifts, next_shifts = (
             {key: draw_shifts(size, pad, generator) for key in keys} for _ in range(2)
         )

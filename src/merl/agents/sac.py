@@ -17,6 +17,7 @@ import tyro
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from merl.agents.config import Positive
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.optimizers import adam, load_optimizer, step_optimizer
 from merl.core import MerlError, UpdatePlan
@@ -28,7 +29,7 @@ from merl.networks.settings import with_torch_settings
 class SACConfig(DDPGConfig):
     """SAC on the state, with a learnt temperature (Haarnoja et al. 2018b)."""
 
-    temperature: float = 1.0
+    temperature: Positive = 1.0
     """Initial value of alpha."""
     target_entropy: float | None = None
     """Target of the policy's entropy, in nats; if not set, minus the dimension of the action."""
@@ -45,10 +46,6 @@ class SACConfig(DDPGConfig):
                 f"agent.critic-loss {self.critic_loss} needs bounded returns, but the entropy "
                 "term makes SAC's returns unbounded: use mse"
             )
-        if not 0 < self.temperature < math.inf:
-            raise MerlError(f"agent.temperature must be above 0, not {self.temperature}")
-        if self.target_entropy is not None and not math.isfinite(self.target_entropy):
-            raise MerlError(f"agent.target-entropy must be finite, not {self.target_entropy}")
 
 
 class SAC(DDPG):

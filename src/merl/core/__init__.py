@@ -19,12 +19,11 @@ from merl.core.types import (
     Batch,
     FrameTransform,
     FrameTransforms,
+    Kind,
     Observation,
     Transition,
     UpdateNoise,
     UpdatePlan,
-    is_image,
-    is_vector,
 )
 
 __all__ = [
@@ -38,6 +37,7 @@ __all__ = [
     "EvaluationFailed",
     "FrameTransform",
     "FrameTransforms",
+    "Kind",
     "MerlError",
     "NotFinite",
     "NotSaved",
@@ -47,7 +47,5 @@ __all__ = [
     "UpdatePlan",
     "check_choice",
     "counted",
-    "is_image",
-    "is_vector",
     "suggest",
 ]

@@ -17,6 +17,7 @@ from merl.core.python_path import set_value, users_value
 FORMS = {
     "task": "module:function, for example my_robot:make_env for my_robot.py",
     "agent": "module:Class, for example my_agent:MyAgent for my_agent.py",
+    "encoder": "module:Class, for example my_robot:WristEncoder for my_robot.py",
 }
 """The expected form of a name, by what the name stands for."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import warnings
+import logging
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,6 +24,9 @@ BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that are part of merl."""
 CLOSE = 0.8
 """Minimum similarity at which an unknown id counts as a misspelling of a known one."""
+
+
+_LOG = logging.getLogger(__name__)
 
 
 def make_user_env(
@@ -130,13 +133,12 @@ def _renders(env: gymnasium.Env[Any, Any]) -> bool:
             env.reset(seed=0)
             image: Any = env.render()
     except MerlError as error:
-        warnings.warn(f"videos of the environment are not possible: {error}", stacklevel=1)
+        _LOG.warning("videos of the environment are not possible: %s", error)
         return False
     usable = isinstance(image, np.ndarray) and image.dtype == np.uint8
     if not usable or image.ndim != 3 or image.shape[2] != 3:
-        warnings.warn(
-            "videos of the environment are not possible: render() does not return uint8 (H, W, 3)",
-            stacklevel=1,
+        _LOG.warning(
+            "videos of the environment are not possible: render() does not return uint8 (H, W, 3)"
         )
         return False
     return True

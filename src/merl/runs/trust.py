@@ -1,10 +1,10 @@
 """Records of the runs that this user has trained: only their code may be imported.
 
-A run folder can come from anyone, and importing the environment or the agent that it names would
-run code. Those of merl and Gymnasium are always allowed. Others are imported only if a record
-outside of the run folder shows that this user trained the run. The record is a file whose name is
-the random id of the run; it holds the names and the folders of their modules. The names and folders
-in `config.json` are not trusted.
+A run folder can come from anyone, and importing the environment, the agent or an encoder that it
+names would run code. Those of merl and Gymnasium are always allowed. Others are imported only if a
+record outside of the run folder shows that this user trained the run. The record is a file whose
+name is the random id of the run; it holds the names and the folders of their modules. The names and
+folders in `config.json` are not trusted.
 """
 
 from __future__ import annotations
@@ -23,37 +23,33 @@ from typing import Any
 from merl.core import MerlError
 from merl.envs.user_env import imports_code
 
+ENVIRONMENT = "environment"
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The origin of the environment and the agent of a run.
+    """The origin of the code of a run.
 
     Attributes:
-        task: `module:function` or `module:Id-v0`, or the id of a Gymnasium environment.
-        folder: the folder of its module; None if the module is installed.
-        agent: `module:Class`, or the name of one of merl's agents.
-        agent_folder: the folder of its module; None if the module is installed.
+        names: see `names`.
+        folders: the folder of the module of each name; none for a module that is installed.
     """
 
-    task: str
-    folder: str | None
-    agent: str = "merl"
-    agent_folder: str | None = None
+    names: Mapping[str, str]
+    folders: Mapping[str, str]
 
     def code(self) -> dict[str, str]:
         """Describe the code that would be imported, with control characters escaped.
 
         Returns:
-            Descriptions by "environment" and "agent"; none of these if it is merl's or Gymnasium's.
+            Descriptions with the keys of `names`; only of code that is not merl's or Gymnasium's.
         """
-        described = {}
-        if imports_code(self.task):
-            described["environment"] = _describe(self.task, self.folder)
-        if ":" in self.agent:
-            described["agent"] = _describe(self.agent, self.agent_folder)
-        return described
+        return {
+            what: _describe(name, self.folders.get(name))
+            for what, name in self.names.items()
+            if (imports_code(name) if what == ENVIRONMENT else ":" in name)
+        }
 
     def __str__(self) -> str:
         """Return the descriptions of `code`."""
@@ -65,24 +61,39 @@ def identity(known: Any = None) -> str:
     return known if _is_identity(known) else uuid.uuid4().hex
 
 
+def names(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a recorded config names: its "environment", "agent", and "encoder of KEY".
+
+    Raises:
+        TypeError: a name is not a string.
+    """
+    found = {ENVIRONMENT: config["task"], "agent": config["agent_name"]}
+    encoders = config["agent"].get("encoders")  # another agent may have no such field
+    if isinstance(encoders, dict):
+        found |= {f"encoder of {key!r}": name for key, name in encoders.items()}
+    _check_strings(found)
+    return found
+
+
 def origin(record: Mapping[str, Any]) -> Origin:
-    """Read the origin of environment and agent from the record of a run (`config.json`).
+    """Read the origin of a run's code from the record of the run (`config.json`).
 
     Raises:
         TypeError: a name or a folder is not a string.
     """
-    config = record["config"]
-    task, agent = config["task"], config.get("agent_name", "merl")
-    folder, agent_folder = record.get("module_folder"), record.get("agent_folder")
-    if not (isinstance(task, str) and isinstance(agent, str)):
-        raise TypeError(f"task is {task!r} and agent_name {agent!r}")
-    if not (isinstance(folder, str | None) and isinstance(agent_folder, str | None)):
-        raise TypeError(f"module_folder is {folder!r} and agent_folder {agent_folder!r}")
-    return Origin(task, folder, agent, agent_folder)
+    folders = record["module_folders"]
+    _check_strings(folders)
+    return Origin(names(record["config"]), folders)
+
+
+def _check_strings(values: Mapping[str, Any]) -> None:
+    for key, value in values.items():
+        if not isinstance(value, str):
+            raise TypeError(f"{key} is {value!r}, not a string")
 
 
 def remember(record: Mapping[str, Any]) -> None:
-    """Record that this user trains a run, if its environment or its agent imports code.
+    """Record that this user trains a run, if the run imports code.
 
     If the record cannot be written, log a warning.
 
@@ -122,7 +133,7 @@ def check(run: Path, record: Mapping[str, Any]) -> Origin:
     except OSError as error:
         reason = f"your records of runs cannot be read ({error})"
     else:
-        if recorded is not None and (recorded.task, recorded.agent) == (stated.task, stated.agent):
+        if recorded is not None and recorded.names == stated.names:
             return recorded
         reason = "you have no record of training it here"
         if recorded is not None:

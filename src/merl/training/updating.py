@@ -94,9 +94,9 @@ def update_on_gpu(
     size = config.replay.batch_size
     if config.replay.compress:
         warn("the compressed replay stays on the host: each update copies its batch to the GPU")
-    elif bytes_on_device(replay.rings) > ROOM * torch.cuda.mem_get_info()[0]:
+    elif bytes_on_device(replay) > ROOM * torch.cuda.mem_get_info()[0]:
         warn("the replay does not fit on the GPU: each update copies its batch to the GPU")
     else:
-        copy = DeviceReplay(replay.rings, agent.device)
+        copy = DeviceReplay(replay, agent.device)
         return UpdateOnDevice(agent, copy, size, randomness.on_device(updates))
     return UpdateFromHost(agent, lambda: replay.sample(size, randomness.batches))

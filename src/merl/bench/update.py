@@ -65,8 +65,8 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
 
     Returns:
         Plain values: `updates_per_s` by variant and `ratio` (to the reference, within each round),
-        each as `median`, `low` and `high` over the rounds; `skipped` and
-        `not_compiled`, the reasons why a variant is missing; the values of `circumstances`.
+        each as `median`, `low` and `high` over the rounds; `skipped` and `not_compiled`, the
+        reasons why a variant is missing; the values of `circumstances`.
     """
     device = choose_device("auto")
     on_gpu = device.type == "cuda"
@@ -96,17 +96,13 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
         variants = ("fp32", False), ("bf16", True), ("bf16", False)
         for precision, compiled in variants:
             whole = f"{OURS}, {precision}{WHOLE}{COMPILED if compiled else ''}"
-            learner = learner_of("merl", precision, device, compiled=compiled)
-            update = UpdateOnDevice(learner, replay, batch_size, seed=0)
             try:
-                for _ in range(Recorded.WARM_UP + 1):
-                    update()
+                learner = learner_of("merl", precision, device, compiled=compiled)
+                sides[whole] = repeated(_recorded(learner, replay, batch_size))
             except Exception as error:
                 if not compiled:
                     raise
                 result["not_compiled"] = f"{whole}: {type(error).__name__}"
-            else:
-                sides[whole] = repeated(update)
     try:
         sides[SB3] = repeated(_stable_baselines(batch_size, device))
         result["stable_baselines"] = SB3_DIFFERS
@@ -141,6 +137,14 @@ def table(result: dict[str, Any]) -> Table:
         notes.append(f"{SB3}: {result['stable_baselines']}")
     rows.caption = "; ".join(notes)
     return rows
+
+
+def _recorded(learner: DDPG, replay: OnDevice, batch_size: int) -> UpdateOnDevice:
+    """Return an update with its batch sampled from a replay on the GPU, recorded as a graph."""
+    update = UpdateOnDevice(learner, replay, batch_size, seed=0)
+    for _ in range(Recorded.WARM_UP + 1):
+        update()
+    return update
 
 
 def load_example(**constants: float) -> ModuleType:

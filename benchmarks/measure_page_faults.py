@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 from merl.agents import make_agent
 from merl.bench.measuring import Work
-from merl.bench.update import as_sample, noise_batch, reference_of
+from merl.bench.update import as_sample, noise_batch, reference
 from merl.config import override
 from merl.core.resources import keep_freed_memory
 from merl.envs import make_env
@@ -50,8 +50,7 @@ def main() -> None:
         batch = random_batch(config, space, actions)
         compare(preset, partial(agent.update, batch, step=0))
         env.close()
-    reference, sample = reference_of("merl"), as_sample(noise_batch(256), vector=True)
-    compare("the reference", partial(reference.update, sample))
+    compare("the reference", partial(reference().update, as_sample(noise_batch(256))))
 
 
 def compare(name: str, update: Work) -> None:

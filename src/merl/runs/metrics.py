@@ -18,8 +18,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from merl.core import METRICS_FILE, MerlError
 
@@ -28,7 +27,7 @@ TENSORBOARD_FOLDER = "tensorboard"
 _LOG = logging.getLogger(__name__)
 
 
-class MetricsWriter:
+class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
     """Writer of the metrics of a run; a context manager.
 
     All rows are also held in memory (a few MB for the longest run). If a new column appears, rows
@@ -63,16 +62,7 @@ class MetricsWriter:
         self._guard(lambda: self._rewrite(None))
         self._guard(self._open_events)
 
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the writer, also after an exception."""
         self.close()
 

@@ -156,7 +156,7 @@ PUBLISHED: dict[str, Published] = {
         {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
     ),
 }
-"""Values that replace the preset's with `--setting published` (docs/agents/)."""
+"""Values that replace the preset's with `--setting published` (docs/explanation/agents/)."""
 
 
 def default_preset() -> str:

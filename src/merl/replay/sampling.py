@@ -88,7 +88,7 @@ class Sampler:
         field = self._fields[name]
         if field.dtype != torch.uint8:
             return field.index_select(0, slots[:, -1])
-        if field.device.type == "cpu":  # there, NumPy takes half the time (docs/bench.md)
+        if field.device.type == "cpu":  # there, NumPy takes half the time
             return torch.from_numpy(field.numpy().take(slots.numpy(), axis=0))
         return field.index_select(0, slots.flatten()).view(*slots.shape, *field.shape[1:])
 

@@ -185,7 +185,7 @@ def measure(
 def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -> bool:
     """Return whether to try a compiled update: on a GPU, for a long run, if the config allows it.
 
-    On a CPU a compiled update was never faster (docs/bench.md).
+    On a CPU a compiled update was never faster (docs/explanation/benchmarks.md).
     """
     left_open = config.agent.torch_compile == "auto"
     return left_open and device.type == "cuda" and timing.seconds(config) > WORTH_COMPILING

@@ -46,7 +46,7 @@ PRESETS: dict[str, Preset] = {
         TrainConfig(_TASK, env=EnvConfig(renderer="gl")),
     ),
     "laptop": Preset(
-        "made for 2 cores without a GPU: learns in half an hour",  # docs/laptop.md
+        "made for 2 cores without a GPU: learns in half an hour",  # docs/explanation/laptop.md
         TrainConfig(
             _TASK,
             steps=1_000_000,

@@ -23,6 +23,7 @@ copyright = "the merl authors"
 release = version = merl.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build", "package.md"]
+highlight_language = "text"
 html_theme = "furo"
 html_title = "merl"
 html_show_sourcelink = False

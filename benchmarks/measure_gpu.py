@@ -213,7 +213,7 @@ def work_of(agent: str, batch_size: int, form: Form) -> tuple[UpdateOnDevice, DD
     """Return an update in the given form, recorded, and the agent that learns by it."""
     device = choose_device("auto")
     learner = update.learner_of(agent, form.precision, device, compiled=form.compiled)
-    replay = OnDevice([update.noise_replay()], device)
+    replay = OnDevice(update.noise_replay(), device)
     work = UpdateOnDevice(learner, replay, batch_size, seed=0)
     if not form.graph:
         work._recorded.WARM_UP = sys.maxsize

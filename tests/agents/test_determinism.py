@@ -16,7 +16,12 @@ from merl.agents.merl import MERLConfig
 CASE = Case(
     "small",
     MERLConfig(
-        latent_dim=32, conv_channels=8, hidden_dim=32, vector_encoder_dim=8, precision="fp32"
+        latent_dim=32,
+        conv_channels=8,
+        hidden_dim=32,
+        encoders={"proprio": "mlp"},
+        mlp_dim=8,
+        precision="fp32",
     ),
 )
 

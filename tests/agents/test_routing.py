@@ -12,7 +12,12 @@ from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 
 CONFIG = MERLConfig(
-    latent_dim=32, conv_channels=8, hidden_dim=32, vector_encoder_dim=16, precision="fp32"
+    latent_dim=32,
+    conv_channels=8,
+    hidden_dim=32,
+    encoders={"proprio": "mlp"},
+    mlp_dim=16,
+    precision="fp32",
 )
 CASE = Case("mlp", CONFIG)
 BOTH_TARGETS = pytest.mark.parametrize("target", ["heads", "heads_and_fusion"])

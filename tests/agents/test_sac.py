@@ -41,9 +41,9 @@ CASES = [
     ),
     Case(
         "camera-and-joints",
-        replace(SMALL, images=None, vectors=None, latent_dim=48, head_norm=True, conv_channels=8),
+        replace(SMALL, keys=None, latent_dim=48, head_norm=True, conv_channels=8),
     ),
-    Case("both-vectors", replace(SMALL, vectors=("state", "touch")), {}, {**STATE, "touch": 2}),
+    Case("both-vectors", replace(SMALL, keys=("state", "touch")), {}, {**STATE, "touch": 2}),
 ]
 
 

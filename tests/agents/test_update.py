@@ -26,6 +26,7 @@ from bridge import (
 )
 from torch import Tensor
 
+from merl import modalities
 from merl.agents import ddpg
 from merl.agents.compiling import compile_parts
 from merl.agents.ddpg import DDPG, DDPGConfig
@@ -38,17 +39,25 @@ from merl.networks.critic import TwinCritic
 SIZES = {"conv_channels": 8, "hidden_dim": 32, "precision": "fp32"}
 SMALL = MERLConfig(latent_dim=48, **SIZES)
 STATE = {"state": 9}
+MLP = {"encoders": {"proprio": "mlp"}, "mlp_dim": 20}
 TWO_CAMERAS = {"front": (24, 28, 3), "wrist": (26, 20, 1)}
 
 CASES = [
     Case("final", SMALL),
     Case("six-layers", replace(SMALL, head_layers=6)),
     Case("averaged-fusion", replace(SMALL, target="heads_and_fusion")),
-    Case("mlp-proprioception", replace(SMALL, vector_encoder_dim=20)),
+    Case("mlp-proprioception", replace(SMALL, **MLP)),
     Case("strides-2211", replace(SMALL, conv_strides=(2, 2, 1, 1))),
     Case("two-cameras", SMALL, images=TWO_CAMERAS),
     Case("two-vectors", SMALL, vectors={"joints": 5, "touch": 2}),
-    Case("simnorm", replace(SMALL, squash="simnorm")),
+    Case("simnorm", replace(SMALL, fusion_layer="simnorm")),
+    Case("attention", replace(SMALL, fusion_layer="attention")),
+    Case(
+        "every-kind",
+        replace(SMALL, fusion_layer="attention"),
+        depths={"depth": (20, 22, 1)},
+        histories={"force": (11, 3)},
+    ),
     Case("without-fusion-norm", replace(SMALL, fusion_norm=False)),
     Case("without-head-norm", replace(SMALL, head_norm=False)),
     Case("without-fusion", replace(SMALL, latent_dim=0)),
@@ -82,8 +91,8 @@ CASES = [
         replace(SMALL, critic_loss="hl_gauss", critic_low=-3.0),
         images={},
     ),
-    Case("proprio", replace(SMALL, images=()), images={}),
-    Case("merl-state", replace(SMALL, images=(), vectors=("state",)), images={}, vectors=STATE),
+    Case("proprio", replace(SMALL, modalities=("vector",)), images={}),
+    Case("merl-state", replace(SMALL, keys=("state",)), images={}, vectors=STATE),
     Case("drqv2", replace(DrQV2Config(), **SIZES, latent_dim=50), vectors={}, step=250_000),
     Case("ddpg", replace(DDPGConfig(), **SIZES), images={}, vectors=STATE),
     Case(
@@ -92,7 +101,7 @@ CASES = [
     ),
     Case(
         "all-at-once",
-        replace(SMALL, head_layers=6, target="heads_and_fusion", vector_encoder_dim=20),
+        replace(SMALL, head_layers=6, target="heads_and_fusion", **MLP),
         images=TWO_CAMERAS,
     ),
 ]
@@ -236,7 +245,7 @@ def test_update_compiled(as_on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.setattr(ddpg, "compile_parts", compile_all)
         monkeypatch.setattr(TwinCritic, "at_once", True)
         monkeypatch.setattr(representation, "shift", augmentation._shift_by_index)
-        monkeypatch.setattr(augmentation, "_centred", augmentation._centred_at_once)
+        monkeypatch.setattr(modalities, "_minus_128", modalities._minus_128_at_once)
     check_in_double_precision(case, updates=5)
     assert case.agent().networks.critic._compiled_call_impl is not None
     # In bf16, compiled code rounds elsewhere, but uses fp32 where eager mode does.

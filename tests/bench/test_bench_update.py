@@ -73,7 +73,7 @@ def pairs(mine: DDPG, plain: Plain) -> Iterator[tuple[nn.Parameter, nn.Parameter
             yield from zipped(linear, other.parts[index][0])
             yield from zipped(norm, other.parts[index][1])
 
-    yield from zipped(networks.encoders.images, plain.encoder)
+    yield from zipped(networks.encoders.by_key, plain.encoder)
     yield from fusions(networks.critic_fusion, plain.critic.fuse)
     yield from zipped(networks.critic.q1, plain.critic.first)
     yield from zipped(networks.critic.q2, plain.critic.second)

@@ -172,7 +172,7 @@ def test_observations_that_contradict_their_space_are_rejected(
     spaces_by_key = {"top": image(20, 20, 3), "arm": vector(2)}
     env = WrongObservationEnv(spaces.Dict(spaces_by_key))
     adapted = adapt(env)
-    adapted.modalities = {key: adapted.modalities[key] for key in keys}  # type: ignore[attr-defined]
+    adapted.keys = {key: adapted.keys[key] for key in keys}  # type: ignore[attr-defined]
     with pytest.raises(MerlError, match=message):
         adapted.reset()
 
@@ -301,13 +301,13 @@ def test_keys_that_are_not_strings_and_missing_spaces_are_rejected() -> None:
         adapt(Bare())
 
 
-def test_a_failing_close_only_warns() -> None:
+def test_a_failing_close_only_warns(caplog: pytest.LogCaptureFixture) -> None:
     class Stuck(SpaceEnv):
         def close(self) -> None:
             raise OSError("the port is busy")
 
-    with pytest.warns(UserWarning, match="close raised OSError: the port is busy"):
-        adapt(Stuck(vector(2))).close()
+    adapt(Stuck(vector(2))).close()
+    assert "close raised OSError: the port is busy" in caplog.text
 
 
 def described_error(path: Path, code: str) -> str:

@@ -24,7 +24,7 @@ def test_preset_paper_is_table_1() -> None:
     assert (agent.learning_rate, agent.tau, agent.latent_dim) == (1e-4, 0.01, 128)
     assert (agent.noise_std, agent.noise_clip, agent.shift_pad) == (0.2, 0.3, 4)
     assert (agent.conv_channels, agent.conv_strides) == (32, (2, 1, 1, 1))
-    assert (agent.hidden_dim, agent.vector_encoder_dim) == (1024, 0)
+    assert (agent.hidden_dim, agent.encoders) == (1024, {})
 
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "paper"])
@@ -68,7 +68,7 @@ def test_every_preset_accepts_every_agent() -> None:
             config = compose(preset, "lift_box", name)
             assert (config.preset, config.agent_name) == (preset, name)
             assert type(config.agent) is type(agent)
-            assert (config.agent.images, config.agent.vectors) == (agent.images, agent.vectors)
+            assert (config.agent.keys, config.agent.modalities) == (agent.keys, agent.modalities)
             for field, value in chosen.agent.items():
                 assert getattr(config.agent, field) == value
 

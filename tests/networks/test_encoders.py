@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from torch import Tensor
 
 from merl.core import MerlError
-from merl.networks.encoders import ConvEncoder, Standardize, VectorEncoder
+from merl.modalities import Image, Modality, Vector
+from merl.networks.encoders.frames import ConvEncoder
+from merl.networks.encoders.vectors import Identity, MLPEncoder, Standardize
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
+
+
+def image(*shape: int, low: int = 0, high: int = 255) -> Image:
+    return Image(spaces.Box(low, high, shape, np.uint8))
+
+
+def vector(length: int) -> Vector:
+    return Vector(spaces.Box(-np.inf, np.inf, (length,), np.float32))
 
 
 def noise(*shape: int) -> Tensor:
@@ -18,7 +30,7 @@ def noise(*shape: int) -> Tensor:
 
 @pytest.mark.parametrize("shade", [0, 128, 255])
 def test_pixels_are_scaled_to_half_a_unit_on_each_side(shade: int) -> None:
-    encoder = ConvEncoder(6, (5, 5), channels=4, strides=(2,)).double()
+    encoder = ConvEncoder(image(5, 5, 3), 2, channels=4, strides=(2,)).double()
     stacks = torch.full((1, 2, 5, 5, 3), shade, dtype=torch.uint8)
     scaled = torch.full((1, 6, 5, 5), shade / 255 - 0.5, dtype=torch.float64)
     expected = encoder.convolutions(scaled).permute(0, 2, 3, 1).flatten(1)
@@ -30,7 +42,7 @@ def test_pixels_are_scaled_to_half_a_unit_on_each_side(shade: int) -> None:
 )
 def test_pixels_are_scaled_by_the_given_bounds(low: int, high: int) -> None:
     torch.manual_seed(0)
-    encoder = ConvEncoder(2, (5, 5), channels=4, strides=(2,), pixels=(low, high)).double()
+    encoder = ConvEncoder(image(5, 5, 1, low=low, high=high), 2, channels=4, strides=(2,)).double()
     stacks = torch.randint(low, high + 1, (3, 2, 5, 5, 1), dtype=torch.uint8)
     stacks[0, 0, 0, 0], stacks[0, 0, 0, 1] = low, high
     scaled = (stacks[..., 0].double() - low) / (high - low) - 0.5
@@ -40,7 +52,7 @@ def test_pixels_are_scaled_by_the_given_bounds(low: int, high: int) -> None:
 
 def test_bf16_encodes_a_binary_mask_accurately() -> None:
     torch.manual_seed(0)
-    encoder = ConvEncoder(9, (84, 84), pixels=(0, 1))
+    encoder = ConvEncoder(image(84, 84, 3, high=1), 3)
     orthogonal(encoder)
     mask = torch.randint(0, 2, (2, 3, 84, 84, 3), dtype=torch.uint8)
     exact = encoder(mask)
@@ -51,7 +63,7 @@ def test_bf16_encodes_a_binary_mask_accurately() -> None:
 def test_bf16_encodes_dark_and_bright_images_accurately() -> None:
     """A bias that absorbed half of all weights would be rounded coarsely, for all images alike."""
     torch.manual_seed(0)
-    encoder = ConvEncoder(9, (84, 84))
+    encoder = ConvEncoder(image(84, 84, 3), 3)
     orthogonal(encoder)
     for dark, bright in ((0, 40), (110, 146), (215, 256)):
         stacks = torch.randint(dark, bright, (2, 3, 84, 84, 3), dtype=torch.uint8)
@@ -62,7 +74,7 @@ def test_bf16_encodes_dark_and_bright_images_accurately() -> None:
 
 
 def test_default_is_the_papers_encoder() -> None:
-    encoder = ConvEncoder(9, (84, 84))
+    encoder = ConvEncoder(image(84, 84, 3), 3)
     convolutions = [m for m in encoder.modules() if isinstance(m, torch.nn.Conv2d)]
     assert [c.stride[0] for c in convolutions] == [2, 1, 1, 1]
     assert all(c.kernel_size == (3, 3) and c.out_channels == 32 for c in convolutions)
@@ -74,12 +86,12 @@ def test_default_is_the_papers_encoder() -> None:
 def test_attribute_features_is_the_output_length(
     size: tuple[int, int], strides: tuple[int, ...]
 ) -> None:
-    encoder = ConvEncoder(6, size, channels=4, strides=strides)
+    encoder = ConvEncoder(image(*size, 2), 3, channels=4, strides=strides)
     assert encoder(noise(2, 3, *size, 2)).shape == (2, encoder.features)
 
 
 def test_features_are_ordered_by_row_column_channel() -> None:
-    encoder = ConvEncoder(3, (9, 11), channels=4, strides=(2,))
+    encoder = ConvEncoder(image(9, 11, 1), 3, channels=4, strides=(2,))
     stacks = noise(2, 3, 9, 11, 1)
     maps = encoder.convolutions(stacks[..., 0] / 255 - 0.5)  # (2, 4, 4, 5)
     features = encoder(stacks)
@@ -104,16 +116,18 @@ def test_too_small_image_is_rejected(
     size: tuple[int, int], strides: tuple[int, ...], fits: bool
 ) -> None:
     if fits:
-        assert ConvEncoder(3, size, strides=strides).features == 32 * (1 if size[0] < 17 else 4)
+        assert ConvEncoder(image(*size, 1), 3, strides=strides).features == 32 * (
+            1 if size[0] < 17 else 4
+        )
     else:
         with pytest.raises(MerlError, match=f"{size[0]}x{size[1]} pixels is too small"):
-            ConvEncoder(3, size, strides=strides)
+            ConvEncoder(image(*size, 1), 3, strides=strides)
 
 
-def test_vector_encoder_of_width_0_is_the_identity() -> None:
-    encoder = VectorEncoder(7)
-    vector = torch.randn(3, 7)
-    assert encoder(vector) is vector
+def test_identity_leaves_a_vector_unchanged() -> None:
+    encoder = Identity(vector(7))
+    values = torch.randn(3, 7)
+    assert torch.equal(encoder(values), values)
     assert encoder.features == 7
     assert not list(encoder.parameters())
 
@@ -126,20 +140,19 @@ def test_vectors_are_standardised() -> None:
     def vectors(count: int) -> torch.Tensor:
         return center + scale * torch.randn(count, 4, generator=draw)
 
-    encoder = VectorEncoder(4, standardize=True)
+    scale_layer = Standardize(4)
     batches = [vectors(128) for _ in range(5)]
     for batch in batches:
-        encoder.observe(batch)
+        scale_layer.observe(batch)
     seen = torch.cat(batches)
-    assert encoder.scale is not None
-    torch.testing.assert_close(encoder.scale.mean, seen.mean(0))
-    torch.testing.assert_close(encoder.scale.variance, seen.var(0, correction=0))
-    encoded = encoder(vectors(10_000))
+    torch.testing.assert_close(scale_layer.mean, seen.mean(0))
+    torch.testing.assert_close(scale_layer.variance, seen.var(0, correction=0))
+    encoded = scale_layer(vectors(10_000))
     assert encoded.std(0)[:2] == pytest.approx(torch.ones(2), rel=0.1)
     assert encoded.mean(0) == pytest.approx(torch.zeros(4), abs=0.15)
     assert encoded.std(0)[2] < 1e-3  # a constant entry is not amplified
     assert encoded.std(0)[3] == pytest.approx(0.01, rel=0.1)
-    assert not list(encoder.parameters())
+    assert not list(scale_layer.parameters())
 
 
 def test_standardisation_is_fixed_after_enough_samples() -> None:
@@ -167,7 +180,7 @@ def test_outliers_are_clipped() -> None:
 
 
 def test_mlp_has_two_layers_and_ends_in_a_relu() -> None:
-    encoder = VectorEncoder(7, 16)
+    encoder = MLPEncoder(vector(7), 16)
     assert encoder.features == 16
     assert sum(isinstance(m, torch.nn.Linear) for m in encoder.modules()) == 2
     out = encoder(torch.randn(50, 7))
@@ -176,8 +189,10 @@ def test_mlp_has_two_layers_and_ends_in_a_relu() -> None:
 
 
 def test_each_modality_is_encoded_images_first() -> None:
-    cameras = {key: ConvEncoder(3, (9, 9), channels=2, strides=(2,)) for key in ("front", "wrist")}
-    encoders = Encoders(cameras, {"proprio": VectorEncoder(5)}, pad=4)
+    keys: dict[str, Modality] = {"front": image(9, 9, 1), "wrist": image(9, 9, 1)}
+    cameras = {key: ConvEncoder(image(9, 9, 1), 3, channels=2, strides=(2,)) for key in keys}
+    keys["proprio"] = vector(5)
+    encoders = Encoders({**cameras, "proprio": Identity(vector(5))}, keys, 4, standardize=False)
     stack = torch.randint(0, 256, (2, 3, 9, 9, 1), dtype=torch.uint8)
     observation = {"proprio": torch.randn(2, 5), "wrist": stack, "front": 255 - stack}
     encoded = encoders(observation)

@@ -21,7 +21,7 @@ from merl.config import TrainConfig
 from merl.core import MerlError, Transition
 from merl.evaluation.policy import Policy
 from merl.networks.settings import torch_settings
-from merl.replay import ReplayBuffer, ReplayConfig
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.runs import checkpoint
 from merl.training.loop import Randomness
 from merl.training.updating import make_update
@@ -105,15 +105,15 @@ def results(config: AgentConfig, folder: Path) -> list[Any]:
     """Build an agent, act, learn from a replay, save and load; return all results."""
     agent = make_agent(config, SPACE, ACTIONS, frame_stack=3, seed=0, device=CPU, threads=1)
     with torch_settings(CPU):
-        replay = ReplayBuffer(CONFIG.replay, SPACE, ACTIONS, count=1, directory=None, capacity=20)
+        replay = ReplayBuffer(ReplaySpec.of(CONFIG.replay, SPACE, ACTIONS, capacity=20))
     env = DotEnv()
     observation, _ = env.reset(seed=0)
-    replay.rings[0].begin(observation)
+    replay.begin(observation)
     policy = Policy(agent, CONFIG, SPACE, CPU)
     for step in range(9):
         action = np.full(1, step / 10, np.float32)
         observation = env.step(action)[0]
-        replay.rings[0].add(Transition(action, step / 10, 1.0, observation, last=False))
+        replay.add(Transition(action, step / 10, 1.0, observation, last=False))
     update = make_update(agent, replay, Randomness(0), CONFIG, print)
     metrics = [update() for _ in range(2)][-1]
     saved = checkpoint.save(folder, 1, agent, {}, score=None, keep=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,21 +11,21 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_replay import Account, Episode, Every, make, write
+from test_replay import Account, Episode, Every, config, make, spec_of, write
 
 from merl.core import Batch
-from merl.replay import EpisodeRing
+from merl.replay import ReplayBuffer
 from merl.replay.on_device import CHUNK, OnDevice, bytes_on_device
 
 EPISODES = st.builds(Episode, st.integers(1, 9), st.sampled_from(["end", "limit", "cut"]))
 
 
-def writing(replay: EpisodeRing, number: int, episodes: list[Episode]) -> Iterator[None]:
-    """Write the episodes, one timestep per iteration."""
-    account = Account(replay.config)
+def writing(replay: ReplayBuffer, number: int, episodes: list[Episode]) -> Iterator[None]:
+    """Write the episodes into ring `number`, one timestep per iteration."""
+    account = Account(replay.spec.config)
     for index, plan in enumerate(episodes):
         for t in range(plan.length + 1):
-            write(replay, account, 100 * number + index, t, plan)
+            write(replay.rings[number], account, 100 * number + index, t, plan)
             yield
 
 
@@ -35,14 +36,24 @@ def tensors(batch: Batch) -> dict[str, torch.Tensor]:
     return observations | rest
 
 
-def check(copy: OnDevice, rings: list[EpisodeRing]) -> None:
+class EveryOfOne(Every):
+    """Draw each step of one ring once, in order."""
+
+    def __init__(self, ring: int) -> None:
+        self.ring = ring
+
+    def multinomial(self, count: int, shares: np.ndarray) -> np.ndarray:
+        return count * np.eye(len(shares), dtype=int)[self.ring]
+
+
+def check(copy: OnDevice, replay: ReplayBuffer) -> None:
     """Compare every step of every ring in the copy with the ring itself."""
-    for number, ring in enumerate(rings):
+    for number, ring in enumerate(replay.rings):
         if not len(ring):
             continue
-        first, steps, _ = ring.counts()
-        found = copy.at(torch.full((steps - first,), number), torch.arange(first, steps))
-        expected = tensors(ring.sample(1, Every()))  # type: ignore[arg-type]
+        steps = torch.arange(ring.first, ring.steps)
+        found = copy.at(torch.full_like(steps, number), steps)
+        expected = tensors(replay.sample(1, EveryOfOne(number)))  # type: ignore[arg-type]
         for name, value in tensors(found).items():
             assert torch.equal(value, expected[name]), name
 
@@ -53,12 +64,10 @@ def test_copy_gives_the_same_samples_as_the_rings(
     plans: list[list[Episode]], data: st.DataObject
 ) -> None:
     stack, n_step = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 4))
-    rings = [make(frame_stack=stack, n_step=n_step) for _ in plans]
-    copy = OnDevice(rings, torch.device("cpu"))
-    writers = [
-        writing(ring, number, plan)
-        for number, (ring, plan) in enumerate(zip(rings, plans, strict=True))
-    ]
+    small = config(capacity=20 * len(plans), frame_stack=stack, n_step=n_step)
+    replay = ReplayBuffer(spec_of(small, rings=len(plans)))
+    copy = OnDevice(replay, torch.device("cpu"))
+    writers = [writing(replay, number, plan) for number, plan in enumerate(plans)]
     every = data.draw(st.integers(1, 40))
     timestep = 0
     while writers:
@@ -68,32 +77,36 @@ def test_copy_gives_the_same_samples_as_the_rings(
         timestep += 1
         if timestep % every == 0:
             copy.follow()
-            check(copy, rings)
+            check(copy, replay)
     copy.follow()
-    check(copy, rings)
+    check(copy, replay)
 
 
 def test_many_new_slots_are_copied_in_chunks() -> None:
-    rings = [make(capacity=3 * CHUNK)]
-    for _ in writing(rings[0], 0, [Episode(50, "limit")] * 300):
+    replay = make(capacity=3 * CHUNK)
+    for _ in writing(replay, 0, [Episode(50, "limit")] * 300):
         pass
-    copy = OnDevice(rings, torch.device("cpu"))
+    copy = OnDevice(replay, torch.device("cpu"))
     copy.follow()
-    check(copy, rings)
-    assert bytes_on_device(rings) > 3 * CHUNK * 36
+    check(copy, replay)
+    assert bytes_on_device(replay) > 3 * CHUNK * 36
 
 
 def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
-    rings = [make(capacity=20) for _ in range(2)]
-    for number, (ring, lengths) in enumerate(zip(rings, ([7, 40], [5]), strict=True)):
-        for _ in writing(ring, number, [Episode(length, "limit") for length in lengths]):
+    replay = ReplayBuffer(spec_of(config(capacity=40), rings=2))
+    for number, lengths in enumerate(([7, 40], [5])):
+        for _ in writing(replay, number, [Episode(length, "limit") for length in lengths]):
             pass
-    copy = OnDevice(rings, torch.device("cpu"))
+    copy = OnDevice(replay, torch.device("cpu"))
     copy.follow()
     count = 25 * 2000
     batch = copy.sample(count, torch.Generator().manual_seed(0))
     drawn, often = batch.action.unique(dim=0, return_counts=True)
-    held = [tuple(row) for ring in rings for row in ring.sample(1, Every()).action.tolist()]  # type: ignore[arg-type]
+    held = [
+        tuple(row)
+        for number in range(2)
+        for row in replay.sample(1, EveryOfOne(number)).action.tolist()  # type: ignore[arg-type]
+    ]
     assert sorted(map(tuple, drawn.tolist())) == sorted(held)
     assert len(held) == 25
     # A chi-squared with 24 degrees of freedom exceeds 52 with probability 0.001.
@@ -102,45 +115,46 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
 
 def test_uninitialised_memory_does_not_reach_a_batch() -> None:
     """The copy's memory on a GPU is not initialised, and may hold NaN."""
-    ring = make(capacity=50)
-    copy = OnDevice([ring], torch.device("cpu"))
+    replay = make(capacity=50)
+    copy = OnDevice(replay, torch.device("cpu"))
     for field in copy._fields.values():
         if field.is_floating_point():
             field.fill_(torch.nan)
-    for _ in writing(ring, 0, [Episode(20, "limit"), Episode(9, "cut")]):
+    for _ in writing(replay, 0, [Episode(20, "limit"), Episode(9, "cut")]):
         copy.follow()
-        check(copy, [ring])
+        check(copy, replay)
 
 
 def test_sampling_does_not_wait_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """On device `meta`, reading a value or using a tensor on another device raises an error."""
-    ring, device, rand = make(capacity=20), torch.device("meta"), torch.rand
-    for _ in writing(ring, 0, [Episode(30, "limit")]):
+    replay, device, rand = make(capacity=20), torch.device("meta"), torch.rand
+    for _ in writing(replay, 0, [Episode(30, "limit")]):
         pass
-    copy = OnDevice([ring], device)
+    copy = OnDevice(replay, device)
     copy.follow()
     monkeypatch.setattr(torch, "rand", lambda *a, generator, **k: rand(*a, **k))
     drawn = tensors(copy.sample(5, torch.Generator()))
-    expected = tensors(ring.sample(5, np.random.default_rng(0)))
+    expected = tensors(replay.sample(5, np.random.default_rng(0)))
     for name, value in drawn.items():
         assert (value.device, value.dtype) == (device, expected[name].dtype)
         assert value.shape == expected[name].shape
 
 
-def test_rings_of_different_lengths_after_growth(tmp_path: Path) -> None:
-    """One ring has wrapped, the other has not; both are opened with a larger capacity."""
-    rings, plans = [], [[Episode(6, "end")] * 5, [Episode(8, "limit")]]
-    for number, plan in enumerate(plans):
-        ring = make(tmp_path / str(number))
-        for _ in writing(ring, number, plan):
+def test_rings_after_growth(tmp_path: Path) -> None:
+    """One ring has wrapped, the other has not; then their capacity is larger."""
+    spec = spec_of(config(capacity=40), rings=2)
+    shorter = ReplayBuffer(spec, tmp_path)
+    for number, plan in enumerate([[Episode(6, "end")] * 5, [Episode(8, "limit")]]):
+        for _ in writing(shorter, number, plan):
             pass
-        rings.append(make(tmp_path / str(number), capacity=30))
-    lengths = [ring.ring_index.length for ring in rings]
-    assert len(set(lengths)) == 2
-    copy = OnDevice(rings, torch.device("cpu"))
+    replay = ReplayBuffer(replace(spec, capacity=60), tmp_path)
+    replay.load_state_dict(shorter.state_dict())
+    copy = OnDevice(replay, torch.device("cpu"))
     for episode in range(6):
         copy.follow()
-        check(copy, rings)
-        for number, ring in enumerate(rings):
-            for _ in writing(ring, 10 + 2 * episode + number, [Episode(7, "limit")]):
-                pass
+        check(copy, replay)
+        for number in range(2):
+            account = Account(spec.config)
+            for t in range(8):
+                index = 100 * number + 10 + episode
+                write(replay.rings[number], account, index, t, Episode(7, "limit"))

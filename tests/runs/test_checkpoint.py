@@ -54,7 +54,7 @@ def weights(agent: DDPG) -> torch.Tensor:
         replace(CONFIG, fusion="shared"),
         replace(CONFIG, fusion="shared_by_both", target="heads_and_fusion"),
         replace(CONFIG, latent_dim=0),
-        SACConfig(images=None, vectors=None, hidden_dim=16, precision="bf16"),
+        SACConfig(keys=None, hidden_dim=16, precision="bf16"),
     ],
     ids=lambda config: f"{type(config).__name__}-{config.fusion}-{config.latent_dim}",
 )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.acting.environments import InProcessEnvs
@@ -16,7 +17,8 @@ from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.config import TrainConfig
-from merl.replay import ReplayBuffer, ReplayConfig
+from merl.modalities import Image, modalities_of
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.replay.on_device import OnDevice
 from merl.training import loop
 from merl.training.loop import (
@@ -53,11 +55,14 @@ class SmallRun:
         self.agent: DDPG = make_agent(
             config.agent, space, actions, frame_stack=3, seed=self.randomness.agent, device=CPU
         )
-        self.replay = ReplayBuffer(config.replay, space, actions, capacity=config.steps)
+        spec = ReplaySpec.of(config.replay, space, actions, capacity=config.steps)
+        self.replay = ReplayBuffer(spec)
         self.progress = Progress()
         self.update: Update = update_from_host(self.agent, self.replay, self.randomness, config)
         self.collector = Collector(
-            InProcessEnvs(self.env), self.replay, [FrameStack(3, ("image",), CPU)]
+            InProcessEnvs(self.env),
+            self.replay,
+            [FrameStack(modalities_of(self.env.observation_space), 3, CPU)],
         )
 
     def results(self) -> Iterator[StepResult]:
@@ -287,7 +292,8 @@ def test_the_seed_determines_the_weights() -> None:
 
 def test_the_frame_stack_for_acting_equals_that_of_the_replay() -> None:
     run = SmallRun(dataclasses.replace(CONFIG, steps=10, seed_steps=10))
-    env, stack = DotEnv(), FrameStack(3, ("image",), CPU)
+    env = DotEnv()
+    stack = FrameStack(modalities_of(env.observation_space), 3, CPU)
     run.finish()
     observation, _ = env.reset(seed=run.randomness.environment())
     stack.reset(observation)
@@ -352,7 +358,8 @@ def test_the_success_share_counts_only_steps_with_a_report() -> None:
 def test_a_reused_frame_does_not_change_the_stack() -> None:
     """A camera driver may return the same array in every step."""
     buffer = np.zeros((2, 2, 1), np.uint8)
-    stack = FrameStack(3, ("camera",), CPU)
+    modalities = {"camera": Image(spaces.Box(0, 255, (2, 2, 1), np.uint8))}
+    stack = FrameStack(modalities, 3, CPU)
     stack.reset({"camera": buffer})
     for value in (1, 2):
         buffer[:] = value
@@ -381,7 +388,7 @@ def test_updates_on_the_device_equal_those_from_the_host(agent: MERLConfig) -> N
     """The code for a GPU runs on the CPU; the twin makes the usual update from each batch."""
     run = SmallRun(dataclasses.replace(CONFIG, agent=agent))
     twin = SmallRun(run.config).agent
-    copy = OnDevice(run.replay.rings, CPU)
+    copy = OnDevice(run.replay, CPU)
     on_device = UpdateOnDevice(run.agent, copy, 8, seed=5)
     same = torch.Generator().manual_seed(5)
 

@@ -20,8 +20,8 @@ AGENTS: dict[str, AgentConfig] = {
     "ddpg": DDPGConfig(),
     "sac": SACConfig(),
     # Two baselines of the paper's argument: proprioception alone, and MERL on the state.
-    "proprio": MERLConfig(images=()),
-    "merl_state": MERLConfig(images=(), vectors=("state",)),
+    "proprio": MERLConfig(modalities=("vector", "sequence")),
+    "merl_state": MERLConfig(keys=("state",)),
 }
 """Default config of each agent, by name."""
 

@@ -35,10 +35,8 @@ from merl.networks.settings import with_torch_settings
 class DDPGConfig(AgentConfig):
     """DDPG on the state, with clipped double Q (Fujimoto et al. 2018) and 3-step returns."""
 
-    images: tuple[str, ...] | None = ()
-    """Image keys to use: none."""
-    vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to use."""
+    keys: tuple[str, ...] | None = ("state",)
+    """Observation keys to use."""
     latent_dim: int = 0
     """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
     head_norm: bool = False
@@ -231,7 +229,7 @@ class DDPG:
         """Draw the random numbers of the next update, for a batch of `size` samples."""
         generator = self.learning
         pad, shape = self.networks.encoders.pad, (size, self.networks.actor.action_dim)
-        keys = self.networks.encoders.image_keys if pad else ()
+        keys = self.networks.encoders.shifted
         shifts, next_shifts = (
             {key: draw_shifts(size, pad, generator) for key in keys} for _ in range(2)
         )

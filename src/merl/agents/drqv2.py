@@ -9,14 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from merl.agents.config import AgentConfig, Target
+from merl.core import Kind
 
 
 @dataclass(frozen=True)
 class DrQV2Config(AgentConfig):
     """DrQ-v2: images alone, with the values of its authors."""
 
-    vectors: tuple[str, ...] | None = ()
-    """Vector keys to use: none."""
+    modalities: tuple[Kind, ...] = ("image", "depth")
+    """Kinds of observations to use if `keys` is not set: cameras alone."""
     latent_dim: int = 50
     """Length of the trunk's output."""
     target: Target = "heads_and_fusion"

@@ -17,7 +17,7 @@ import tyro
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from merl.agents.config import AgentConfig
+from merl.agents.config import AgentConfig, Positive
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import Networks
 from merl.agents.optimizers import load_optimizer, step_optimizer
@@ -29,15 +29,13 @@ from merl.networks.settings import with_torch_settings
 class SACConfig(AgentConfig):
     """SAC on the state, with a learnt temperature (Haarnoja et al. 2018b)."""
 
-    images: tuple[str, ...] | None = ()
-    """Image keys to use: none."""
-    vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to use."""
+    keys: tuple[str, ...] | None = ("state",)
+    """Observation keys to use."""
     latent_dim: int = 0
     """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
     head_norm: bool = False
     """LayerNorm in the hidden layers of actor and critic."""
-    temperature: float = 1.0
+    temperature: Positive = 1.0
     """Initial value of alpha."""
     target_entropy: float | None = None
     """Target of the policy's entropy, in nats; if not set, minus the dimension of the action."""
@@ -54,10 +52,6 @@ class SACConfig(AgentConfig):
                 f"agent.critic-loss {self.critic_loss} needs bounded returns, but the entropy "
                 "term makes SAC's returns unbounded: use mse"
             )
-        if not 0 < self.temperature < math.inf:
-            raise MerlError(f"agent.temperature must be above 0, not {self.temperature}")
-        if self.target_entropy is not None and not math.isfinite(self.target_entropy):
-            raise MerlError(f"agent.target-entropy must be finite, not {self.target_entropy}")
 
 
 class SAC(DDPG):

@@ -18,15 +18,15 @@ from rich.table import Table
 
 from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack
-from merl.acting.run_env import make_run_env, run_spaces
+from merl.acting.run_env import make_run_env, run_spaces, run_spec
 from merl.acting.workers import WorkerEnvs
 from merl.agents import make_agent
 from merl.bench.measuring import Side, circumstances, shown, spread
 from merl.config import TrainConfig
-from merl.core import counted, is_image
+from merl.core import counted
 from merl.core.resources import keep_freed_memory
 from merl.experiments.presets import compose
-from merl.replay import ReplayBuffer
+from merl.replay import ReplayBuffer, ReplaySpec
 from merl.training.loop import Collector, Progress, Randomness, train
 from merl.training.setup import choose_device
 from merl.training.timing import measure, use_threads
@@ -153,10 +153,11 @@ class _Loop:
         )
         stack.callback(environments.close)
         device, frames = choose_device(config.device), config.replay.frame_stack
-        images = tuple(key for key in space if is_image(space[key]))
         count = environments.count
-        replay = ReplayBuffer(config.replay, space, actions, count=count, capacity=CAPACITY)
-        stacks = [FrameStack(frames, images, device) for _ in range(count)]
+        spec = ReplaySpec.of(config.replay, space, actions, capacity=CAPACITY, rings=count)
+        replay = ReplayBuffer(spec)
+        modalities = run_spec(config, env).modalities
+        stacks = [FrameStack(modalities, frames, device) for _ in range(count)]
         agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)
         self._progress = Progress()
         collector = Collector(environments, replay, stacks)

@@ -22,7 +22,7 @@ from merl.agents.ddpg import DDPG
 from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
 from merl.bench.plain import Encoder, Plain, Sample
 from merl.core import Batch, MerlError, Transition, counted
-from merl.replay import EpisodeRing, ReplayConfig
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.replay.on_device import OnDevice
 from merl.training.setup import choose_device
 from merl.training.timing import Arithmetic
@@ -80,7 +80,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
 
     result: dict[str, Any] = {"repeats": repeats, "batch_size": batch_size} | circumstances()
     batch = noise_batch(batch_size).to(device)
-    replay = OnDevice([noise_replay()], device) if on_gpu else None
+    replay = OnDevice(noise_replay(), device) if on_gpu else None
     sides: dict[str, Work] = {}
     of: dict[str, str] = {}
     for reference, ours, agent in ((REFERENCE, OURS, "merl"), (DRQV2, OUR_DRQV2, "drqv2")):
@@ -193,10 +193,10 @@ def learner_of(
     return make_agent(config, space_of(side), actions, frame_stack=STACK, seed=0, device=device)
 
 
-def noise_replay(steps: int = 2000) -> EpisodeRing:
+def noise_replay(steps: int = 2000) -> ReplayBuffer:
     """Return a replay filled with noise, in episodes of 250 steps."""
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
-    replay = EpisodeRing(ReplayConfig(), space_of(), actions, capacity=steps)
+    replay = ReplayBuffer(ReplaySpec.of(ReplayConfig(), space_of(), actions, capacity=steps))
     rng = np.random.default_rng(0)
     for step in range(steps):
         seen = {

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from merl.cli.parsing import parse
 from merl.cli.running import go_on, tell_trusted
-from merl.core import MerlError
+from merl.config import Device
+from merl.core.fields import Range, check_fields
 from merl.runs.resume import reopened
 from merl.runs.run import Run
 
@@ -22,19 +23,18 @@ class ResumeOptions:
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
-    steps: int | None = None
+    steps: Annotated[int, Range(1)] | None = None
     """Train to this total number of steps; by default to the run's own --steps."""
-    minutes: float | None = None
+    minutes: Annotated[float, Range(0, without=0)] | None = None
     """Stop after this many minutes from now; by default there is no time limit."""
-    device: Literal["auto", "cpu", "cuda"] | None = None
+    device: Device | None = None
     """Where the networks live from now on; by default where they were before."""
     trust: tyro.conf.FlagCreatePairsOff[bool] = False
     """Import the environment that the run names, although you have not trained this run here. This
     runs the code of the run's author."""
 
     def __post_init__(self) -> None:
-        if self.steps is not None and self.steps < 1:
-            raise MerlError(f"steps must be at least 1, not {self.steps}")
+        check_fields(self, "--")
 
 
 def resume(args: list[str]) -> int:

@@ -18,10 +18,9 @@ from merl.core.types import (
     Batch,
     FrameTransform,
     FrameTransforms,
+    Kind,
     Observation,
     Transition,
-    is_image,
-    is_vector,
 )
 
 __all__ = [
@@ -34,6 +33,7 @@ __all__ = [
     "EvaluationFailed",
     "FrameTransform",
     "FrameTransforms",
+    "Kind",
     "MerlError",
     "NotFinite",
     "NotSaved",
@@ -41,7 +41,5 @@ __all__ = [
     "Transition",
     "check_choice",
     "counted",
-    "is_image",
-    "is_vector",
     "suggest",
 ]

@@ -9,19 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     import torch
-    from gymnasium import spaces
     from torch import Tensor
 
 Observation = Mapping[str, NDArray[Any]]
-"""The observation of one timestep, one key per modality: an image is uint8 (H, W, C), a vector
-float32 (n,). It holds single frames; acting and replay stack them."""
+"""The observation of one timestep: `merl.modalities` has the types and shapes. It holds single
+frames; acting and replay stack them."""
+
+Kind = Literal["image", "depth", "vector", "sequence"]
+"""Kinds of observations; `merl.modalities` has a class for each."""
 
 FrameTransform = Callable[[int, NDArray[np.uint8], NDArray[np.uint8]], None]
 """A function that copies a stack of frames from the replay into a batch, e.g. with a random shift.
@@ -33,17 +35,6 @@ CONFIG_FILE = "config.json"
 """File in a run folder that holds the config of the run."""
 METRICS_FILE = "metrics.csv"
 """File in a run folder that holds the metrics of the run."""
-
-
-def is_image(space: spaces.Space[Any]) -> bool:
-    """Return whether the space is that of an image: a uint8 box of shape (H, W, C)."""
-    return space.dtype == np.uint8 and space.shape is not None and len(space.shape) == 3
-
-
-def is_vector(space: spaces.Space[Any]) -> bool:
-    """Return whether the space is that of a vector: a float box of shape (n,)."""
-    floats = space.dtype is not None and np.issubdtype(space.dtype, np.floating)
-    return bool(floats) and space.shape is not None and len(space.shape) == 1
 
 
 @dataclass(frozen=True)
@@ -70,8 +61,9 @@ class Batch:
     """The input of one update: B samples of (o_t, a_t, r_{t:t+n-1}, o_{t+n}).
 
     Attributes:
-        observation: o_t; images uint8 (B, K, H, W, C) with the oldest of the K stacked frames
-            first, vectors float32 (B, n).
+        observation: o_t, as stored (`merl.modalities`): stacked frames (B, K, H, W, C) with the
+            oldest of the K first, images uint8 and depth int16; vectors float32 (B, n), histories
+            float32 (B, T, n).
         action: a_t, float32 (B, A), in [-1, 1].
         reward: sum of gamma^i r_{t+i} for i < m, float32 (B,); m = n, or less if the episode ends
             earlier.

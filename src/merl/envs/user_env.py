@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import logging
 import sys
-import warnings
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec
 from pathlib import Path
@@ -27,6 +27,9 @@ BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that are part of merl."""
 CLOSE = 0.8
 """Minimum similarity at which an unknown id counts as a misspelling of a known one."""
+
+
+_LOG = logging.getLogger(__name__)
 
 
 def make_user_env(
@@ -215,13 +218,12 @@ def _renders(env: gymnasium.Env[Any, Any]) -> bool:
             env.reset(seed=0)
             image: Any = env.render()
     except MerlError as error:
-        warnings.warn(f"videos of the environment are not possible: {error}", stacklevel=1)
+        _LOG.warning("videos of the environment are not possible: %s", error)
         return False
     usable = isinstance(image, np.ndarray) and image.dtype == np.uint8
     if not usable or image.ndim != 3 or image.shape[2] != 3:
-        warnings.warn(
-            "videos of the environment are not possible: render() does not return uint8 (H, W, 3)",
-            stacklevel=1,
+        _LOG.warning(
+            "videos of the environment are not possible: render() does not return uint8 (H, W, 3)"
         )
         return False
     return True

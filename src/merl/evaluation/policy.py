@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,15 @@ from merl.acting.rollout import FrameStack
 from merl.acting.run_env import make_run_env, own_bounds, run_spaces
 from merl.agents import make_agent
 from merl.config import TrainConfig
-from merl.core import Agent, MerlError, NotFinite, Observation, is_image
-from merl.envs.user_spaces import Modality
+from merl.core import Agent, MerlError, NotFinite, Observation
+from merl.envs.user_spaces import UserKey
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.video import MIN_SIDE
+from merl.modalities import modalities_of
 from merl.runs.checkpoint import Checkpoint, load_networks, readable
 from merl.runs.run import Run
+
+_LOG = logging.getLogger(__name__)
 
 
 class Policy:
@@ -51,9 +54,10 @@ class Policy:
         self.config, self.step, self._run = config, step, run
         self.reports_success = reports_success
         self._agent = agent
-        self._modalities = {key: _as_trained(key, space[key]) for key in agent.senses}
-        images = tuple(key for key in agent.senses if is_image(space[key]))
-        self._stack = FrameStack(config.replay.frame_stack, images, device)
+        known = modalities_of(space)
+        modalities = {key: known[key] for key in agent.senses}
+        self._keys = {key: UserKey.as_trained(key, m) for key, m in modalities.items()}
+        self._stack = FrameStack(modalities, config.replay.frame_stack, device)
         self._fresh = True
 
     def reset(self) -> None:
@@ -64,8 +68,8 @@ class Policy:
         """Return the action for an observation.
 
         Args:
-            observation: an observation of the environment: images uint8 (H, W, C), vectors float
-                (n,).
+            observation: an observation of the environment, with the types and shapes of training
+                (merl.modalities).
 
         Returns:
             The action, float32 (A,), in [-1, 1].
@@ -75,7 +79,7 @@ class Policy:
                 converted to an array.
             NotFinite: the observation contains NaN or infinity.
         """
-        sensed = {key: self._checked(key, observation) for key in self._modalities}
+        sensed = {key: self._checked(key, observation) for key in self._keys}
         if self._fresh:
             self._stack.reset(sensed)
         else:
@@ -103,10 +107,11 @@ class Policy:
         if renderer == "auto" and not self.config.own_env:
             renderer = changes["renderer"] = self.config.env.renderer
         if renderer != self.config.env.renderer and not self.config.own_env:
-            warnings.warn(
-                f"the agent was trained with renderer {self.config.env.renderer!r} but now uses "
-                f"{renderer!r}: their images differ, and the agent may perform worse",
-                stacklevel=2,
+            _LOG.warning(
+                "the agent was trained with renderer %r but now uses %r: their images differ, and "
+                "the agent may perform worse",
+                self.config.env.renderer,
+                renderer,
             )
             changes.setdefault("samples", 1)  # the recorded value is for that renderer
         if self._run is not None:
@@ -171,22 +176,14 @@ class Policy:
         if not isinstance(observation, Mapping):
             raise MerlError(
                 f"the observation is a {type(observation).__name__}: give a dict with the keys "
-                f"{list(self._modalities)}"
+                f"{list(self._keys)}"
             )
         if key not in observation:
-            raise MerlError(
-                f"the observation lacks {key!r}: the agent needs {list(self._modalities)}"
-            )
-        value = self._modalities[key].convert(observation[key])
+            raise MerlError(f"the observation lacks {key!r}: the agent needs {list(self._keys)}")
+        value = self._keys[key].convert(observation[key])
         if not np.isfinite(value).all():
             raise NotFinite(f"observation {key!r} contains NaN or infinity: {value}")
         return value
-
-
-def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
-    """Return the check of an observation key that needs no conversion."""
-    assert isinstance(space, spaces.Box)
-    return Modality(key, space, space)
 
 
 def load_policy(

@@ -206,7 +206,7 @@ def compose(
         replay = dataclasses.replace(config.replay, **published.replay)
         config = dataclasses.replace(config, replay=replay, **published.run)
         values = dict(published.agent)
-    if base.vectors and task not in ENV_IDS:  # only merl's own tasks have the key `state`
-        values["vectors"] = None
+    if base.keys and task not in ENV_IDS:  # only merl's own tasks have the key `state`
+        values |= {"keys": None, "modalities": ("vector", "sequence")}
     made = dataclasses.replace(base, **values)
     return dataclasses.replace(config, agent_name=name, agent=made)

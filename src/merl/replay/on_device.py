@@ -7,82 +7,66 @@ part of a CUDA graph.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 
 import torch
 from torch import Tensor
 
 from merl.core import Batch
-from merl.replay.ring import EpisodeRing
+from merl.replay.buffer import ReplayBuffer
 from merl.replay.sampling import Sampler
 
 CHUNK = 4096
 """Maximum number of slots that are copied at once."""
 
 
-def bytes_on_device(rings: Sequence[EpisodeRing]) -> int:
+def bytes_on_device(replay: ReplayBuffer) -> int:
     """Return the bytes that the copy takes."""
-    return sum(array.nbytes for ring in rings for array in ring.arrays().values())
+    return sum(array.nbytes for array in replay.arrays.values())
 
 
 class OnDevice:
-    """Copy, on a device, of rings with the same spaces, one after the other.
+    """Copy, on a device, of a replay.
 
     Args:
-        rings: rings on the host, without compression.
+        replay: the replay on the host, without compression.
         device: device of the copy.
     """
 
-    def __init__(self, rings: Sequence[EpisodeRing], device: torch.device) -> None:
-        first = rings[0]
-        self._rings, self._device = rings, device
-        self._keys, self._capacity = first.keys, first.capacity
-        lengths = [ring.ring_index.length for ring in rings]
-        self._first_slots = [sum(lengths[:index]) for index in range(len(rings))]
-        self._bases = torch.tensor(self._first_slots, device=device)
-        self._slots = torch.tensor(lengths, device=device)
+    def __init__(self, replay: ReplayBuffer, device: torch.device) -> None:
+        self._replay, self._device = replay, device
         self._fields = {
-            name: torch.empty(
-                (sum(lengths), *array.shape[1:]),
-                dtype=torch.from_numpy(array[:0]).dtype,
-                device=device,
-            )
-            for name, array in first.arrays().items()
+            name: torch.empty_like(torch.from_numpy(array), device=device)
+            for name, array in replay.arrays.items()
         }
-        self._sources = torch.zeros(len(rings) * self._capacity, dtype=torch.int64, device=device)
+        rings = len(replay.rings)
+        self._sources = torch.zeros(
+            rings * replay.spec.ring_capacity, dtype=torch.int64, device=device
+        )
         # For each ring: its first step that can be sampled, its steps so far, and its newest
-        # timestep, numbered such that number 1 is in its first slot.
-        self._counts = torch.zeros((len(rings), 3), dtype=torch.int64, device=device)
+        # timestep.
+        self._counts = torch.zeros((rings, 3), dtype=torch.int64, device=device)
         self._host_counts = torch.zeros_like(self._counts, device="cpu")
-        self._copied = [(0, 0)] * len(rings)  # timesteps and steps that were copied
-        self._sampler = Sampler(self._fields, first.config)
+        self._sampler = Sampler(self._fields, replay.spec, replay.slots)
 
     def follow(self) -> None:
         """Copy what was added to the rings since the last call."""
-        counts = torch.tensor(
-            [
-                (*counts, timesteps - ring.ring_index.origin)
-                for ring in self._rings
-                for *counts, timesteps in [ring.counts()]
-            ]
-        )
-        if torch.equal(counts, self._host_counts):
+        replay, had = self._replay, self._host_counts
+        counts = torch.tensor([(ring.first, ring.steps, ring.timesteps) for ring in replay.rings])
+        if torch.equal(counts, had):
             return
         self._host_counts = counts
-        for index, (ring, (_, steps, timesteps)) in enumerate(
-            zip(self._rings, counts.tolist(), strict=True)
-        ):
-            had_timesteps, had_steps = self._copied[index]
-            arrays = {name: torch.from_numpy(array) for name, array in ring.arrays().items()}
-            for part in _parts(had_timesteps, timesteps, ring.ring_index.length):
-                at = self._first_slots[index] + part.start
+        arrays = {name: torch.from_numpy(array) for name, array in replay.arrays.items()}
+        for number, ring in enumerate(replay.rings):
+            _, had_steps, had_timesteps = had[number].tolist()
+            for begin, end in _parts(had_timesteps, ring.timesteps, replay.slots):
+                base = number * replay.slots
                 for name, array in arrays.items():
-                    self._copy(array[part], self._fields[name], at)
-            for part in _parts(had_steps, steps, self._capacity):
-                sources = torch.from_numpy(ring.sources[part] - ring.ring_index.origin)
-                self._copy(sources, self._sources, index * self._capacity + part.start)
-            self._copied[index] = (timesteps, steps)
+                    self._copy(array[base + begin : base + end], self._fields[name], base + begin)
+            for begin, end in _parts(had_steps, ring.steps, replay.spec.ring_capacity):
+                sources = torch.from_numpy(ring.sources[begin:end])
+                self._copy(sources, self._sources, number * replay.spec.ring_capacity + begin)
         self._copy(counts, self._counts, 0)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
@@ -106,11 +90,11 @@ class OnDevice:
 
     def at(self, ring: Tensor, step: Tensor) -> Batch:
         """Return the samples that start at steps `step` of rings `ring`, each int64 (B,)."""
-        source = self._sources[ring * self._capacity + step % self._capacity]
-        newest = self._counts[ring, 2]
-        indices = self._sampler.pick(source, newest, self._bases[ring], self._slots[ring])
+        capacity = self._replay.spec.ring_capacity
+        source = self._sources[ring * capacity + step % capacity]
+        indices = self._sampler.pick(ring, source, self._counts[ring, 2])
         now, then = (
-            {key: self._sampler.observed(name, slots) for key, name in self._keys.items()}
+            {key: self._sampler.observed(key, slots) for key in self._replay.spec.keys}
             for slots in (indices.now, indices.then)
         )
         return Batch(now, self._sampler.action(indices), indices.reward, indices.discount, then)
@@ -122,11 +106,11 @@ class OnDevice:
         whole[at : at + len(part)].copy_(part, non_blocking=True)
 
 
-def _parts(had: int, has: int, length: int) -> Iterator[slice]:
-    """Yield the ring's slices with entries `had` to `has` - 1, at most the last `length`."""
+def _parts(had: int, has: int, length: int) -> Iterator[tuple[int, int]]:
+    """Yield begin and end of the parts with entries `had` to `has` - 1, at most `length`."""
     begin = max(had, has - length)
     marks = {begin, has, *range(begin, has, CHUNK)}
     marks |= set(range(-(-begin // length) * length, has, length))
     for start, stop in pairwise(sorted(marks)):
         at = start % length
-        yield slice(at, at + stop - start)
+        yield at, at + stop - start

@@ -218,8 +218,7 @@ class Collector:
             return
         for index, observation in self.environments.reset(starting).items():
             check_finite(observation, 0.0, progress.step, self._where(index))
-            self.replay.rings[index].begin(observation)
-            self.stacks[index].reset(observation)
+            self.replay.begin(self.stacks[index].reset(observation), index)
             self._episodes[index] = Episode()
 
     def act(self, actions: NDArray[np.float32]) -> None:
@@ -236,10 +235,9 @@ class Collector:
             check_finite(step.observation, step.reward, reached, self._where(index))
             over = bool(step.terminated or step.truncated)
             discount = 0.0 if step.terminated else 1.0
-            self.replay.rings[index].add(
-                Transition(self._actions[index], step.reward, discount, step.observation, over)
-            )
-            self.stacks[index].push(step.observation)
+            stored = self.stacks[index].push(step.observation)
+            transition = Transition(self._actions[index], step.reward, discount, stored, over)
+            self.replay.add(transition, index)
             self._episodes[index].add(step.reward, step.info)
             progress.step += repeat
             if over:

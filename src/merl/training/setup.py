@@ -15,7 +15,7 @@ import torch
 from gymnasium import spaces
 
 from merl.acting.env_checks import check_instances
-from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces
+from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
@@ -25,7 +25,7 @@ from merl.core import MerlError, counted
 from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.user_env import load_module
 from merl.evaluation.video import MIN_SIDE
-from merl.replay import check_fits
+from merl.replay import ReplaySpec, check_fits
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
 from merl.training.loop import Progress, Randomness
@@ -44,8 +44,10 @@ class Setup:
         eval_env: the environment for evaluation; None without evaluations (`eval.every` is 0).
         home: the working folder at the start; a relative run folder is relative to it.
         records_video: whether `eval_env` renders images.
+        spec: what the agent observes.
         space: the observation space, with the keys that the agent uses.
         action_space: the action space.
+        replay_spec: what the replay stores.
         device: device of the networks.
         agent: the learner.
         progress: counts of steps, updates and episodes.
@@ -58,9 +60,12 @@ class Setup:
         env: gymnasium.Env[Any, Any],
         eval_env: gymnasium.Env[Any, Any] | None,
         home: Path,
+        replay_spec: ReplaySpec,
     ) -> None:
         self.env, self.eval_env, self.home = env, eval_env, home
+        self.replay_spec = replay_spec
         self.records_video = eval_env is not None and eval_env.render_mode == "rgb_array"
+        self.spec = run_spec(config, env)
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
         bounded(config.agent, config.replay.discount)  # reject bad values before timing
@@ -120,16 +125,14 @@ class Setup:
         with ExitStack() as stack:
             env = make_run_env(config)
             stack.callback(env.close)
-            space, actions = run_spaces(config, env)
+            replay_spec = ReplaySpec.of(
+                config.replay,
+                *run_spaces(config, env),
+                capacity=config.capacity,
+                rings=config.num_envs,
+            )
             if new:
-                check_fits(
-                    config.replay,
-                    space,
-                    actions,
-                    directory=run_path(config, home),
-                    capacity=config.capacity,
-                    rings=config.num_envs,
-                )
+                check_fits(replay_spec, run_path(config, home))
             eval_env = None
             if config.eval.every:
                 size = max(config.env.render_size, MIN_SIDE)
@@ -141,7 +144,7 @@ class Setup:
                 expected.check(EnvSpaces.of(config, eval_env), "the one for evaluations")
                 if config.own_env:
                     check_instances(env, eval_env)
-            yield cls(config, env, eval_env, home)
+            yield cls(config, env, eval_env, home, replay_spec)
 
 
 def bounded(agent: AgentConfig, discount: float) -> AgentConfig:

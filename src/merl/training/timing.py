@@ -24,7 +24,8 @@ from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.config import TrainConfig
-from merl.core import Batch, MerlError, counted, is_image
+from merl.core import Batch, MerlError, counted
+from merl.modalities import modalities_of
 from merl.networks.settings import torch_settings
 from merl.training.loop import Update
 from merl.training.updating import Recorded
@@ -202,14 +203,10 @@ def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -
     size, stack = config.replay.batch_size, config.replay.frame_stack
 
     def observation() -> dict[str, torch.Tensor]:
-        return {key: modality(box) for key, box in space.items()}
-
-    def modality(box: spaces.Space[Any]) -> torch.Tensor:
-        assert box.shape is not None
-        if is_image(box):
-            shape = (size, stack, *box.shape)
-            return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
-        return torch.randn((size, *box.shape), generator=generator)
+        return {
+            key: modality.random(size, stack, generator)
+            for key, modality in modalities_of(space).items()
+        }
 
     return Batch(
         observation(),

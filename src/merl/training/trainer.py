@@ -20,7 +20,6 @@ from merl.core import (
     MerlError,
     NotFinite,
     counted,
-    is_image,
 )
 from merl.core.guards import LossGuard
 from merl.core.signals import Interrupt
@@ -164,14 +163,7 @@ class Trainer:
             self._interrupt = stack.enter_context(Interrupt().listening())
             self._metrics = stack.enter_context(MetricsWriter(run.path, self._callbacks.on_warning))
             with torch_settings(setup.device):
-                self.replay = ReplayBuffer(
-                    self.config.replay,
-                    setup.space,
-                    setup.action_space,
-                    count=self.config.num_envs,
-                    directory=run.replay,
-                    capacity=self.config.capacity,
-                )
+                self.replay = ReplayBuffer(setup.replay_spec, run.replay)
             with self._interrupt.raising():
                 self._environments = self._make_environments()
             stack.callback(self._environments.close)
@@ -274,9 +266,8 @@ class Trainer:
     def _steps(self) -> Iterable[StepResult]:
         """Return the loop of Algorithm 1, which yields after every step of the environments."""
         setup = self.setup
-        images = tuple(key for key in setup.space if is_image(setup.space[key]))
         stacks = [
-            FrameStack(self.config.replay.frame_stack, images, setup.device)
+            FrameStack(setup.spec.modalities, setup.spec.frame_stack, setup.device)
             for _ in range(self._environments.count)
         ]
         update = make_update(
@@ -352,7 +343,7 @@ class Trainer:
     def _is_to_stop(self) -> bool:
         """Return whether a signal, a callback or the time limit stops the run."""
         minutes = self.config.minutes
-        spent = minutes is not None and self._clock.stretch() > minutes * 60
+        spent = minutes is not None and self._clock.seconds_since_start() > minutes * 60
         return spent or self._callback_stops or self._interrupt.number is not None
 
     def _at_episode_end(self) -> None:

@@ -82,10 +82,10 @@ def _fastest_update(
         torch.cuda.empty_cache()  # return the cached memory of the timed agents
         if config.replay.compress:
             warn("the compressed replay stays on the host: each update copies its batch to the GPU")
-        elif bytes_on_device(replay.rings) > ROOM * torch.cuda.mem_get_info()[0]:
+        elif bytes_on_device(replay) > ROOM * torch.cuda.mem_get_info()[0]:
             warn("the replay does not fit on the GPU: each update copies its batch to the GPU")
         else:
-            copy = OnDevice(replay.rings, agent.device)
+            copy = OnDevice(replay, agent.device)
             seed = randomness.on_device(updates)
             return UpdateOnDevice(agent, copy, config.replay.batch_size, seed)
         size = config.replay.batch_size

@@ -1,77 +1,64 @@
-"""Reading of image stacks from the ring, with read-ahead for images that are only on disk."""
+"""Reading of frame stacks from the replay, with read-ahead for frames that are only on disk."""
 
 from __future__ import annotations
 
 import mmap
 import resource
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import FrameTransform
+from merl.replay.compression import CompressedFrames
+from merl.replay.spec import Field
 
 
-class Pictures(Protocol):
-    """Images of one observation key, by slot.
-
-    Attributes:
-        shape: shape of an image, (H, W, C).
-    """
-
-    shape: tuple[int, ...]
-
-    def stacks(self, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-        """Yield the frames (K, H, W, C) of each row of slots (B, K), valid until the next."""
-        ...
-
-    def stretch(
-        self, first: NDArray[np.int64], last: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return where the bytes from one slot's image to another's begin and end, for many pairs.
-
-        If the ring's end lies between the two images, the end comes before the beginning.
-        """
-        ...
-
-
-class RawPictures:
-    """Uncompressed images.
+class RawFrames:
+    """Uncompressed frames of one observation key, by slot.
 
     Args:
-        ring: the images, (slots, H, W, C).
+        field: type and shape of a frame, e.g. uint8 (H, W, C).
+        data: the frames, (slots, *shape).
     """
 
-    def __init__(self, ring: NDArray[np.uint8]) -> None:
-        self._ring, self.shape = ring, ring.shape[1:]
-        self._bytes = ring[0].nbytes
+    def __init__(self, field: Field, data: NDArray[Any]) -> None:
+        self.field, self._data = field, data
 
-    def stacks(self, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-        """Yield views of contiguous slots, else copies; see `Pictures`."""
+    def stacks(self, slots: NDArray[np.int64]) -> Iterator[NDArray[Any]]:
+        """Yield the frames (K, *shape) of each row of slots (B, K), valid until the next.
+
+        Frames in contiguous slots are not copied.
+        """
         contiguous = (np.diff(slots, axis=1) == 1).all(axis=1)
         for first, last, these, whole in zip(
             slots[:, 0].tolist(), slots[:, -1].tolist(), slots, contiguous.tolist(), strict=True
         ):
-            yield self._ring[first : last + 1] if whole else self._ring[these]
+            yield self._data[first : last + 1] if whole else self._data[these]
 
-    def stretch(
+    def byte_range(
         self, first: NDArray[np.int64], last: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return byte ranges; see `Pictures`."""
-        return first * self._bytes, (last + 1) * self._bytes
+        """Return the first byte of the frames in slots `first`, and the byte after slots `last`.
+
+        If the ring's end lies between two frames, the end comes before the beginning.
+        """
+        return first * self.field.bytes, (last + 1) * self.field.bytes
 
 
-def as_it_is(_: int, frames: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
+def copy_unchanged(_: int, frames: NDArray[Any], out: NDArray[Any]) -> None:
     """Copy the frames unchanged; a `FrameTransform`."""
     out[:] = frames
 
 
-def copied(pictures: Pictures, slots: NDArray[np.int64], copy: FrameTransform) -> NDArray[np.uint8]:
-    """Return the images at slots (B, K), each stack copied by `copy`: (B, K, H, W, C)."""
-    out = np.empty((*slots.shape, *pictures.shape), np.uint8)
-    for sample, (frames, place) in enumerate(zip(pictures.stacks(slots), out, strict=True)):
-        copy(sample, frames, place)
+def copy_stacks(
+    frames: RawFrames | CompressedFrames, slots: NDArray[np.int64], transform: FrameTransform
+) -> NDArray[Any]:
+    """Return the frames at slots (B, K), each stack copied by `transform`: (B, K, *shape)."""
+    out = np.empty((*slots.shape, *frames.field.shape), frames.field.dtype)
+    for sample, (stack, place) in enumerate(zip(frames.stacks(slots), out, strict=True)):
+        transform(sample, stack, place)
     return out
 
 
@@ -108,7 +95,7 @@ class ReadAhead:
             self._left -= 1
 
     @staticmethod
-    def ask(file: mmap.mmap, begin: NDArray[np.int64], end: NDArray[np.int64]) -> None:
+    def request(file: mmap.mmap, begin: NDArray[np.int64], end: NDArray[np.int64]) -> None:
         """Request these byte ranges of a file, without waiting for them.
 
         Ranges that end before they begin are skipped.

@@ -67,7 +67,7 @@ class TrainConfig:
     """
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-    """Task: reach_duplo, move_box, lift_box, the id of a Gymnasium environment, or module:function,
+    """Task: reach_duplo or another one of `merl tasks`, a Gymnasium id, or module:function,
     where the function makes an environment."""
     preset: tyro.conf.Suppress[str] = "paper"
     """Set of default values for the other options: paper, laptop, state or smoke."""

@@ -2,7 +2,7 @@
 
 It shares no code with the package: no layer, no optimizer, no helper. One flat dict holds every
 weight under its symbol in the paper, every random number is an argument, and one update is a pure
-function from a state to the next. `docs/paper.md` lists the choices that the paper leaves open.
+function from a state to the next. docs/explanation/paper.md lists what the paper leaves open.
 
     symbol          meaning
     xi.KEY          image encoder f of one camera

@@ -31,10 +31,10 @@ def with_mean(mean: float, **config: float) -> DDPG:
     return agent
 
 
-@pytest.mark.parametrize("squash", ["tanh", "simnorm"])
-def test_action_without_noise_equals_the_reference(squash: str) -> None:
+@pytest.mark.parametrize("layer", ["tanh", "simnorm", "attention"])
+def test_action_without_noise_equals_the_reference(layer: str) -> None:
     """Acting does not shift images, so the reference uses the crop in the middle."""
-    case = replace(WITH_IMAGE, config=replace(CONFIG, squash=squash))
+    case = replace(WITH_IMAGE, config=replace(CONFIG, fusion_layer=layer))
     agent = double(case.agent())
     weather(agent)
     w, spec = state_of(agent).weights, case.spec

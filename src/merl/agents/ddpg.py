@@ -4,7 +4,7 @@ An update learns from a batch of (o_t, a_t, r_{t:t+n-1}, o_{t+n}); the agent's n
 the observations. The methods `update_critic`, `update_actor` and `update_target` follow
 Algorithm 1.
 
-Agent `ddpg` is this learner on the state, without changes (docs/agents/ddpg.md).
+Agent `ddpg` is this learner on the state, without changes (docs/explanation/agents/ddpg.md).
 """
 
 from __future__ import annotations

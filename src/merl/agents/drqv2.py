@@ -1,7 +1,7 @@
 """DrQ-v2 (Yarats et al. 2021a): the same learner on images alone.
 
 Its trunk (Linear, LayerNorm and tanh to 50 features; one for the critic and one for the actor) is
-MERL's fusion with a single modality. docs/agents/drqv2.md gives the source of every value.
+MERL's fusion with a single modality. docs/explanation/agents/drqv2.md has each value's source.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ The procedures are in `merl.agents.ddpg`, the values are the defaults of `merl.a
     Q_phi1-bar, Q_phi2-bar                critic_target: a copy of the Q-heads alone
     UPDATECRITIC, UPDATEACTOR             DDPG.update_critic, DDPG.update_actor
 
-Where the paper is silent or contradicts itself, `docs/paper.md` lists the choice made here.
+docs/explanation/paper.md lists the choices made where the paper is silent or contradicts itself.
 """
 
 from __future__ import annotations

@@ -190,7 +190,7 @@ def _nothing_to_use(
         return f"{what}: add --agent.modalities {' '.join(kinds)}"
     if given:
         return f"{what}: --agent.privileged leaves no key for the actor"
-    return f"{what}: docs/environments.md lists the boxes that agents can use"
+    return f"{what}: docs/howto/environment.md lists the boxes that agents can use"
 
 
 def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:

@@ -1,9 +1,6 @@
 """The command line.
 
-Exit codes (docs/running.md): 0 success; 2 bad input, reported in one line; 3 a NaN or an infinity
-stopped the run; 4 an environment failed (a run that had begun is saved); 5 the run ended, but its
-last checkpoint or metrics could not be saved; 129, 130, 138 and 143 stopped by SIGHUP, Ctrl-C,
-SIGUSR1 or SIGTERM, and saved; 141 nothing reads the output of a command that only prints.
+docs/reference/exit_codes.md explains the exit codes.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ RendererName = Literal["gl", "raster"]
 RendererChoice = Literal["auto", "gl", "raster"]
 AUTO_RENDERER: RendererName = "raster"
 """The renderer that replaces `auto`. It works on every machine, and is the faster one where both
-were measured (docs/bench.md). It does not depend on the machine, so the same code gives the same
-images everywhere."""
+were measured (docs/explanation/benchmarks.md). It does not depend on the machine, so the same code
+gives the same images everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding", "carrying"]

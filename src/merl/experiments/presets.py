@@ -49,7 +49,7 @@ PRESETS: dict[str, Preset] = {
         TrainConfig(_TASK, env=EnvConfig(renderer="gl")),
     ),
     "laptop": Preset(
-        "made for 2 cores without a GPU: learns in half an hour",  # docs/laptop.md
+        "made for 2 cores without a GPU: learns in half an hour",  # docs/explanation/laptop.md
         TrainConfig(
             _TASK,
             steps=1_000_000,
@@ -159,7 +159,7 @@ PUBLISHED: dict[str, Published] = {
         {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
     ),
 }
-"""Values that replace the preset's with `--setting published` (docs/agents/)."""
+"""Values that replace the preset's with `--setting published` (docs/explanation/agents/)."""
 
 
 def default_preset() -> str:

@@ -44,7 +44,7 @@ CASES = (
     Case(PENDULUM, "ddpg", 20_000),
     Case(PENDULUM, "sac", 20_000),
 )
-"""The cases of docs/small_tasks.md."""
+"""The cases of docs/explanation/small_tasks.md."""
 
 _SMALL: dict[str, Any] = {"hidden_dim": 128}
 _PENDULUM: dict[str, Any] = _SMALL | {"learning_rate": 1e-3}

@@ -92,7 +92,7 @@ class Sampler:
         field, spec = self._fields[field_name(key)], self._spec.keys[key]
         if not spec.stacked:
             slots = slots[:, -1]
-        if field.device.type == "cpu":  # there, NumPy takes half the time (docs/bench.md)
+        if field.device.type == "cpu":  # there, NumPy takes half the time
             return torch.from_numpy(field.numpy().take(slots.numpy(), axis=0))
         rows = field.view(len(field), -1).view(torch.uint8).index_select(0, slots.flatten())
         return rows.view(field.dtype).view(*slots.shape, *spec.shape)

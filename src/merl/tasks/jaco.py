@@ -207,7 +207,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
             physics: the simulation.
             which: `paper`: sine and cosine of each arm joint's angle (12), the arm's joint
                 velocities in rad/s (6), the fingers' joint angles in rad (3) and velocities in
-                rad/s (3). `full`: also the arm's joint torques (6) as sign(x) log(1 + |x|) of
+                rad/s (3). `full`: also the arm's joint torques (6), sign(x) log(1 + abs(x)) of
                 N m, and the pinch site's position in m (3) and rotation matrix (9).
 
         Returns:

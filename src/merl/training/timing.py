@@ -190,7 +190,7 @@ def measure(
 def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -> bool:
     """Return whether to try a compiled update: on a GPU, for a long run, if the config allows it.
 
-    On a CPU a compiled update was never faster (docs/bench.md).
+    On a CPU a compiled update was never faster (docs/explanation/benchmarks.md).
     """
     agent = config.agent
     left_open = isinstance(agent, AgentConfig) and agent.torch_compile == "auto"

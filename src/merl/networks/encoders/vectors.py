@@ -16,7 +16,7 @@ class Standardize(nn.Module):
     Without it, a velocity of 5 rad/s dominates a position of 5 cm. Mean and deviation are those of
     the vectors passed to `observe`, and stay fixed after `STEADY` samples. Results are clipped to
     `FARTHEST` deviations: the entries of an object that rests most of the time are hundreds of
-    deviations off when it is touched, and would dominate everything else (docs/tasks.md).
+    deviations off when it is touched, and would dominate the rest (docs/explanation/state.md).
 
     Args:
         features: length of the vector, or of each sample of a history.

@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
 # The record: preset laptop on reach_duplo for MINUTES (60) with each seed, one after the other, and
-# 50 evaluation episodes of each. Wants the machine to itself. A seed that is done is not run again;
-# one that was stopped continues. The rows and the episodes go to docs/speedrun/data.
-#     docs/speedrun/run.sh                                     # seeds 0, 1, 2
-#     MINUTES=10 docs/speedrun/run.sh
-#     MINUTES=90 NAME=avx2 ONEDNN_MAX_CPU_ISA=AVX2 docs/speedrun/run.sh 0
+# 50 evaluation episodes of each. Needs the machine to itself. A seed that is done is not run again;
+# one that was stopped continues. The rows and the episodes go to results/speedrun.
+#     benchmarks/speedrun.sh                                     # seeds 0, 1, 2
+#     MINUTES=10 benchmarks/speedrun.sh
+#     MINUTES=90 NAME=avx2 ONEDNN_MAX_CPU_ISA=AVX2 benchmarks/speedrun.sh 0
 set -euo pipefail
-cd "$(dirname "$0")/../.."
+cd "$(dirname "$0")/.."
 minutes=${MINUTES:-60}
-name=laptop${NAME:+-$NAME}-$minutes data=docs/speedrun/data
+name=laptop${NAME:+-$NAME}-$minutes data=results/speedrun
 mkdir -p "$data"
 [ $# -gt 0 ] || set -- 0 1 2
 for seed in "$@"; do
@@ -24,4 +24,4 @@ for seed in "$@"; do
   cp "$run/metrics.csv" "$data/$name-s$seed.csv"
   merl evaluate "$run" --episodes 50 --json "$data/$name-s$seed-evaluation.json"
 done
-python docs/speedrun/record.py
+python benchmarks/speedrun.py

@@ -1,9 +1,11 @@
 """`JacoEnv` and `make_env`: spaces, episodes, seeds, settings."""
 
 import warnings
+from contextlib import closing
 from dataclasses import fields
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -11,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from merl.core import MerlError
 from merl.envs import EnvConfig, make_env
 from merl.envs.registration import ENV_IDS, register
+from merl.envs.rendering import check_renderer
 from merl.tasks import TASKS
 
 ACTION = np.zeros(9, np.float32)
@@ -297,3 +300,90 @@ def test_defaults_of_the_settings():
         "reward": "paper",
         "render_size": 480,
     }
+
+
+def needs_opengl():
+    try:
+        check_renderer("gl")
+    except MerlError as error:
+        pytest.skip(f"no OpenGL library works on this machine: {error}")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_both_renderers_see_the_same_distances(task):
+    needs_opengl()
+    config = {"observations": ("depth",), "image_size": 64}
+    with (
+        closing(make_env(task, renderer="gl", **config)) as gl,
+        closing(make_env(task, renderer="raster", **config)) as raster,
+    ):
+        rng = np.random.default_rng(0)
+        for step in range(30):
+            if step % 10 == 0:
+                one, two = (env.reset(seed=step)[0]["depth"] for env in (gl, raster))
+            else:
+                action = rng.uniform(-1, 1, 9)
+                one, two = (env.step(action)[0]["depth"] for env in (gl, raster))
+            difference = np.abs(one - two)
+            assert np.quantile(difference, 0.98) < 0.015  # m; more at silhouettes alone
+            assert 0.3 < one.min() < 1.0  # the hand or the arm
+            assert raster.observation_space["depth"].contains(two)
+
+
+def test_depth_is_the_distance_along_the_cameras_axis():
+    with closing(make_env("reach_duplo", observations=("depth",), image_size=65)) as env:
+        observation, _ = env.reset(seed=0)
+        physics = env.physics
+        camera = physics.model.name2id("front_close", "camera")
+        position = physics.data.cam_xpos[camera]
+        axis = -physics.data.cam_xmat[camera].reshape(3, 3)[:, 2]
+        distance = mujoco.mj_ray(
+            physics.model.ptr, physics.data.ptr, position, axis, None, 1, -1, np.zeros(1, np.int32)
+        )
+        assert observation["depth"][32, 32, 0] == pytest.approx(distance, rel=0.02)
+
+
+def test_touch_feels_the_grasp_of_a_box():
+    config = {"observations": ("touch",), "start": ("holding",)}
+    with closing(make_env("lift_box", **config)) as env:
+        observation, _ = env.reset(seed=0)
+        assert observation["touch"].shape == (7,)
+        close = np.zeros(9)
+        close[6:] = 1.0
+        for _ in range(5):
+            observation, *_ = env.step(close)
+        forces = np.expm1(observation["touch"])
+        palm, fingers = forces[0], forces[1:].reshape(3, 2).sum(axis=1)
+        assert palm < 200
+        assert (fingers > 1.0).sum() >= 2  # N; two fingers at least hold the box
+        total = sum(contact_forces(env.physics))
+        assert forces.sum() == pytest.approx(total, rel=0.5)
+
+
+def contact_forces(physics):
+    """Yield the normal force of each contact of the hand."""
+    model, data = physics.model.ptr, physics.data.ptr
+    for index, contact in enumerate(data.contact):
+        bodies = [
+            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, model.geom_bodyid[geom]) or ""
+            for geom in (contact.geom1, contact.geom2)
+        ]
+        if any("jaco_hand" in body for body in bodies):
+            force = np.zeros(6)
+            mujoco.mj_contactForce(model, data, index, force)
+            yield force[0]
+
+
+def test_sensors_of_touch_do_not_change_the_simulation_or_the_images():
+    plain = {"observations": ("image", "state"), "image_size": 32}
+    felt = {"observations": ("image", "touch", "state"), "image_size": 32}
+    with (
+        closing(make_env("move_box", **plain)) as one,
+        closing(make_env("move_box", **felt)) as two,
+    ):
+        first, second = one.reset(seed=4)[0], two.reset(seed=4)[0]
+        for step in range(20):
+            for key in plain["observations"]:
+                np.testing.assert_array_equal(first[key], second[key])
+            action = np.random.default_rng(step).uniform(-1, 1, 9)
+            first, second = one.step(action)[0], two.step(action)[0]

@@ -13,8 +13,9 @@ import tyro
 from merl.agents import AGENTS
 from merl.agents.config import AgentConfig
 from merl.core import MerlError, check_choice, counted, suggest
+from merl.core.choices import HandStart
 from merl.core.fields import NOT_EMPTY, Range, check_fields
-from merl.envs.config import EnvConfig, StartName, UserEnvConfig
+from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 
@@ -31,6 +32,23 @@ NotNegative = Annotated[int, Range(0)]
 
 
 @dataclass(frozen=True)
+class Source:
+    """Where the values of a config come from; a run records it beside the config.
+
+    Attributes:
+        preset: the preset's name.
+        setting: source of the agent's values: the preset, or the agent's authors.
+    """
+
+    preset: str = "custom"
+    setting: Setting = "matched"
+
+
+CUSTOM = Source()
+"""The source of a config that is not made from a preset."""
+
+
+@dataclass(frozen=True)
 class EvaluationConfig:
     """Settings of the evaluations: the agent acts without noise, from fixed start states."""
 
@@ -39,7 +57,7 @@ class EvaluationConfig:
     instance of the environment is made, as a single physical robot requires."""
     episodes: Steps = 10
     """Number of episodes of each evaluation."""
-    start: Annotated[tuple[StartName, ...], NOT_EMPTY] | None = None
+    start: Annotated[tuple[HandStart, ...], NOT_EMPTY] | None = None
     """Start of the hand in evaluations (see `--start`); if not set, the same as in training."""
     max_episode_steps: Steps = 2000
     """Limit in steps for evaluation episodes that do not end earlier."""
@@ -69,13 +87,8 @@ class TrainConfig:
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """Task: reach_duplo, move_box, lift_box, the id of a Gymnasium environment, or module:function,
     where the function makes an environment."""
-    preset: tyro.conf.Suppress[str] = "paper"
-    """Set of default values for the other options: paper, laptop, state or smoke."""
     agent_name: tyro.conf.Suppress[str] = "merl"
     """Name of the agent, which `agent` configures."""
-    setting: tyro.conf.Suppress[Setting] = "matched"
-    """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
-    (published)."""
     seed: NotNegative = 0
     """Seed of all randomness in the run."""
     steps: Steps = 1_000_000

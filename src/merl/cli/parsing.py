@@ -69,7 +69,7 @@ def _message(event: _errors.ParseErrorEvent, options: Any) -> str | None:
         case _errors.UnrecognizedArgs(tokens=tokens):
             return _unknown(tokens, event.prog, options)
         case _errors.InvalidChoice(argument=argument, value=value, choices=choices):
-            known = [choice for choice in choices if choice != "None"]  # None: omit the flag
+            known = sorted({*choices} - {"None"})  # None: omit the flag
             return f"{argument.display_name()} {value!r} is unknown: {suggest(value, known)}"
         case _errors.BadValue(argument=argument):
             return f"{argument.display_name()} needs a value: {argument.lowered.metavar}"

@@ -11,7 +11,7 @@ import torch
 import tyro
 
 from merl.agents import AGENTS
-from merl.config import EvaluationConfig, Setting, TrainConfig
+from merl.config import EvaluationConfig, Setting, TrainConfig, override
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
 from merl.envs.registration import ENV_IDS
@@ -110,37 +110,27 @@ PRESETS: dict[str, Preset] = {
     ),
 }
 
+_EVERY_STEP = {"updates_per_step": 1.0, "replay.batch_size": 256, "replay.n_step": 1}
 HEAD_LAYERS = {"move_box": 6, "lift_box": 6}
 """Layers of MERL's heads in preset `paper`, for tasks with other than three (MERL C.1)."""
 
 
-@dataclass(frozen=True)
-class Published:
-    """Values that an agent's authors used.
-
-    Attributes:
-        run: fields of `TrainConfig`.
-        replay: fields of `ReplayConfig`.
-        agent: fields of the agent's config.
-    """
-
-    run: Mapping[str, Any]
-    replay: Mapping[str, Any] = field(default_factory=dict)
-    agent: Mapping[str, Any] = field(default_factory=dict)
-
-
-PUBLISHED: dict[str, Published] = {
+PUBLISHED: dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
     # DrQ-v2's repository, for its tasks of medium difficulty: each action is held for two steps, an
     # update every second action, 2000 random actions, noise that falls over 500,000 actions.
-    "drqv2": Published(
-        {"action_repeat": 2, "updates_per_step": 0.25, "random_steps": 4000, "seed_steps": 4000},
-        {"batch_size": 256},
+    "drqv2": (
+        {
+            "action_repeat": 2,
+            "updates_per_step": 0.25,
+            "random_steps": 4000,
+            "seed_steps": 4000,
+            "replay.batch_size": 256,
+        },
         {"noise_steps": 1_000_000},
     ),
     # TD3's repository; its DDPG has noise in its actions and none in its updates.
-    "ddpg": Published(
-        {"updates_per_step": 1.0, "random_steps": 25_000, "seed_steps": 25_000},
-        {"batch_size": 256, "n_step": 1},
+    "ddpg": (
+        {"random_steps": 25_000, "seed_steps": 25_000, **_EVERY_STEP},
         {
             "learning_rate": 3e-4,
             "tau": 0.005,
@@ -150,13 +140,13 @@ PUBLISHED: dict[str, Published] = {
         },
     ),
     # Haarnoja et al. 2018b, Table 1; SAC's repository begins with ten episodes of random actions.
-    "sac": Published(
-        {"updates_per_step": 1.0, "random_steps": 10_000, "seed_steps": 10_000},
-        {"batch_size": 256, "n_step": 1},
+    "sac": (
+        {"random_steps": 10_000, "seed_steps": 10_000, **_EVERY_STEP},
         {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
     ),
 }
-"""Values that replace the preset's with `--setting published` (docs/agents/)."""
+"""Values that replace the preset's with `--setting published` (docs/agents/): those of the run and
+those of the agent's config."""
 
 
 def default_preset() -> str:
@@ -184,12 +174,9 @@ def compose(
     name = agent or chosen.agent_name
     check_choice("agent", name, tuple(AGENTS))
     check_choice("setting", setting, get_args(Setting))
-    config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
-    if config.own_env:
-        config = dataclasses.replace(config, **chosen.own_env)
-    else:  # not for a user's environment: it may be a robot, which must not move unless asked
-        evaluation = dataclasses.replace(config.eval, references=True)
-        config = dataclasses.replace(config, eval=evaluation)
+    config = dataclasses.replace(chosen.config, task=task)
+    # A user's environment may be a robot, which must not move unless asked.
+    config = override(config, chosen.own_env if config.own_env else {"eval.references": True})
     values = dict(chosen.agent)
     base = AGENTS[name]
     if preset == "paper" and base.head_norm:
@@ -202,10 +189,7 @@ def compose(
                 f"agent {name!r} has no setting published: choose from {', '.join(PUBLISHED)}; for "
                 "the paper's values use preset paper"
             )
-        published = PUBLISHED[name]
-        replay = dataclasses.replace(config.replay, **published.replay)
-        config = dataclasses.replace(config, replay=replay, **published.run)
-        values = dict(published.agent)
+        config, values = override(config, PUBLISHED[name][0]), dict(PUBLISHED[name][1])
     if base.vectors and task not in ENV_IDS:  # only merl's own tasks have the key `state`
         values["vectors"] = None
     made = dataclasses.replace(base, **values)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from gymnasium import spaces
 
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError
 from merl.envs.user_env import imports_code, load_module
 from merl.runs import record, trust
@@ -64,6 +64,7 @@ class Run:
         bounds: Bounds | None = None,
         left_open: tuple[str, ...] = REOPENED,
         *,
+        source: Source = CUSTOM,
         home: Path | None = None,
     ) -> Iterator[Run]:
         """Create the folder of a new run, lock it, and write its config; unlock it at the end.
@@ -75,13 +76,14 @@ class Run:
             bounds: the bounds of the environment's actions before rescaling; None if they are not
                 rescaled.
             left_open: names of the fields that the user left open.
+            source: where the config's values come from.
             home: see `run_path`.
 
         Raises:
             MerlError: the folder holds other files, cannot be created, or is in use by another
                 process.
         """
-        path, created = create_folder(config, home)
+        path, created = create_folder(config, source, home)
         run = cls(path, config, left_open, created)
         with ExitStack() as stack:
             try:
@@ -98,8 +100,7 @@ class Run:
                     "id": trust.identity(),
                     "task": config.task,
                     "agent": config.agent_name,
-                    "preset": config.preset,
-                    "setting": config.setting,
+                    **dataclasses.asdict(source),
                     "seed": config.seed,
                     **record.describe_config(config, left_open),
                     **record.describe_spaces(observation_space, action_space, bounds),

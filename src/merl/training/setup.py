@@ -20,7 +20,7 @@ from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import make_networks
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import MerlError, counted
 from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.user_env import load_module
@@ -93,13 +93,14 @@ class Setup:
 
     @classmethod
     @contextmanager
-    def prepare(cls, config: TrainConfig, *, new: bool) -> Iterator[Setup]:
+    def prepare(cls, config: TrainConfig, *, new: bool, source: Source = CUSTOM) -> Iterator[Setup]:
         """Make environments and agent of a run, and check its config; write no files.
 
         Args:
             config: the config of the run.
             new: whether the run is new: its folder must not exist, its replay must fit, and the
                 module of a user's environment may be in the working folder.
+            source: where the config's values come from; it names the folder of a new run.
 
         Raises:
             MerlError: a device, a renderer, an observation or a folder is not available, or a size
@@ -114,7 +115,7 @@ class Setup:
             )
         home = Path.cwd()  # before user code runs, which may change the working folder
         if new:
-            refuse_existing(run_path(config, home))
+            refuse_existing(run_path(config, source, home))
             if config.own_env and ":" in config.task:
                 load_module(config.task, home)
         with ExitStack() as stack:
@@ -126,7 +127,7 @@ class Setup:
                     config.replay,
                     space,
                     actions,
-                    directory=run_path(config, home),
+                    directory=run_path(config, source, home),
                     capacity=config.capacity,
                     rings=config.num_envs,
                 )

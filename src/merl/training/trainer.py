@@ -12,7 +12,7 @@ from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.acting.run_env import own_bounds
 from merl.acting.workers import WorkerEnvs
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import (
     EnvironmentFailed,
     EnvironmentsLost,
@@ -76,6 +76,7 @@ class Trainer:
     Args:
         config: the run's config.
         callbacks: called at the events of training.
+        source: where the config's values come from; recorded with a new run.
         resumed: None for a new run; else the run to resume, whose lock the caller holds, and the
             checkpoint to resume from, or None to start at the first step.
 
@@ -98,16 +99,19 @@ class Trainer:
         config: TrainConfig,
         callbacks: Iterable[Callback] = (),
         *,
+        source: Source = CUSTOM,
         resumed: tuple[Run, Checkpoint | None] | None = None,
     ) -> None:
         with ExitStack() as stack:
-            self.setup = stack.enter_context(Setup.prepare(config, new=resumed is None))
+            self.setup = stack.enter_context(
+                Setup.prepare(config, new=resumed is None, source=source)
+            )
             setup = self.setup
             if resumed is not None:
                 bounds = own_bounds(setup.env)
                 resumed[0].check_environment(setup.space, setup.action_space, bounds)
             self._resources = stack.pop_all()
-        self.config, self._resumed = setup.config, resumed
+        self.config, self._source, self._resumed = setup.config, source, resumed
         self._callbacks = CallbackList(callbacks)
         self._averages, self._guard = Averages(), LossGuard()
         self._worker_losses = 0
@@ -147,7 +151,13 @@ class Trainer:
         space, actions = setup.space, setup.action_space
         bounds = own_bounds(setup.env)
         with Run.begin(
-            self.config, space, actions, bounds, setup.left_open, home=setup.home
+            self.config,
+            space,
+            actions,
+            bounds,
+            setup.left_open,
+            source=self._source,
+            home=setup.home,
         ) as run:
             try:
                 return self._fit(run, None)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound="DataclassInstance")
 Setting = Literal["matched", "published"]
-
+"""Source of an agent's values: MERL and the preset, or the agent's authors."""
 Video = Literal["each", "last", "none"]
 Device = Literal["auto", "cpu", "cuda"]
 Steps = Annotated[int, Range(1, 10**12)]
@@ -33,12 +33,7 @@ NotNegative = Annotated[int, Range(0)]
 
 @dataclass(frozen=True)
 class Source:
-    """Where the values of a config come from; a run records it beside the config.
-
-    Attributes:
-        preset: the preset's name.
-        setting: source of the agent's values: the preset, or the agent's authors.
-    """
+    """Where the values of a config come from; a run records it beside the config."""
 
     preset: str = "custom"
     setting: Setting = "matched"

@@ -153,8 +153,9 @@ def _fit(
             trainer = stack.enter_context(Trainer(config, [view], source=source, resumed=resumed))
         done = resumed[1].step if resumed and resumed[1] else 0
         console.print(_outlook(trainer.setup, what, done), highlight=False)
-        if resumed is None and source.preset != "laptop":
-            _suggest_laptop(trainer.setup, console)
+        seconds = trainer.setup.timing.seconds(trainer.config)
+        if resumed is None and source.preset != "laptop" and seconds > DAY:
+            console.print("that is more than a day: --preset laptop is made for such a machine")
         return trainer.fit()
 
 
@@ -186,12 +187,6 @@ def _scale(config: TrainConfig) -> dict[str, float]:
         for reference in references(config.task, config.evaluated.env)
         if reference.name in (RANDOM, EXPERT)
     }
-
-
-def _suggest_laptop(setup: Setup, console: Console) -> None:
-    """Say that another preset suits this machine, if the run takes more than a day."""
-    if setup.timing.seconds(setup.config) > DAY:
-        console.print("that is more than a day: --preset laptop is made for a machine like this")
 
 
 def _outlook(setup: Setup, what: str, done: int) -> str:

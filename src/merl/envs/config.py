@@ -81,11 +81,7 @@ class EnvConfig:
 
 
 def check_samples(samples: int, size: int) -> None:
-    """Reject more samples along an edge than the largest image has.
-
-    Args:
-        samples: samples along each edge of a pixel.
-        size: height and width of the image, in pixels.
+    """Reject more samples along an edge of an image of `size` pixels than `LARGEST_IMAGE`.
 
     Raises:
         MerlError: naming the values and the bound.

@@ -61,10 +61,7 @@ def reopened(config: TrainConfig, names: Iterable[str] = REOPENED) -> TrainConfi
 
 
 def decided(config: TrainConfig) -> TrainConfig:
-    """Return a config in which device, threads, precision and compilation have fixed values.
-
-    The values are arbitrary.
-    """
+    """Return a config in which device, threads, precision and compilation are not left open."""
     return override(config, _DECIDED)
 
 

@@ -28,12 +28,7 @@ from merl.runs import record, trust
 from merl.runs.provenance import machine
 from merl.runs.record import FORMAT, Bounds
 from merl.runs.resume import REOPENED
-from merl.runs.run_folder import (
-    create_folder,
-    discard_folder,
-    lock_folder,
-    refuse_existing,
-)
+from merl.runs.run_folder import create_folder, discard_folder, lock_folder, refuse_existing
 from merl.runs.trust import Origin
 
 

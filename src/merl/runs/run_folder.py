@@ -143,13 +143,11 @@ def discard_folder(run: Path, created: bool) -> None:
         run: the folder.
         created: this process has created the folder, so the folder is deleted, too.
     """
-    for name in (*_FOLDERS, *_FILES):
-        path = run / name
-        if name in _FOLDERS:
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
+    for name in _FOLDERS:
+        shutil.rmtree(run / name, ignore_errors=True)
+    for name in _FILES:
+        with suppress(OSError):
+            (run / name).unlink(missing_ok=True)
     if created:
         with suppress(OSError):  # the folder holds files of others
             run.rmdir()

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from merl.config import Setting, TrainConfig, override
+from merl.config import CUSTOM, Setting, Source, TrainConfig, override
 from merl.envs.config import RendererName
 from merl.evaluation.evaluation import Evaluation
 from merl.evaluation.policy import load_policy
@@ -52,12 +52,13 @@ def train(
     if isinstance(agent, type):
         agent = f"{agent.__module__}:{agent.__qualname__}"
     if isinstance(task, str):
-        config = compose(preset or default_preset(), task, agent, setting)
+        source = Source(preset or default_preset(), setting)
+        config = compose(source.preset, task, agent, setting)
     else:
-        config = task
+        source, config = CUSTOM, task
     if overrides.get("run_dir") is not None:
         overrides["run_dir"] = Path(overrides["run_dir"])
-    with Trainer(override(config, overrides), callbacks) as trainer:
+    with Trainer(override(config, overrides), callbacks, source=source) as trainer:
         return trainer.fit()
 
 

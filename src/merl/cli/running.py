@@ -15,7 +15,7 @@ from merl.acting.run_env import key_lines
 from merl.cli.duration import DurationView, duration
 from merl.cli.output import make_console
 from merl.cli.summary import summarize
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import MerlError, NotSaved, counted
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint, readable
@@ -28,14 +28,15 @@ from merl.training.trainer import Outcome, Trainer
 DAY = 86_400.0  # seconds
 
 
-def begin(config: TrainConfig, what: str) -> int:
+def begin(config: TrainConfig, source: Source, what: str) -> int:
     """Train a new run to its end; return the exit code.
 
     Args:
         config: the config of the run.
+        source: where its values come from.
         what: a description of the run, for the first printed line.
     """
-    return _train(config, what)
+    return _train(config, what, source=source)
 
 
 def go_on(
@@ -110,12 +111,15 @@ def tell_trusted(run: Run) -> None:
 
 
 def _train(
-    config: TrainConfig, what: str, resumed: tuple[Run, Checkpoint | None] | None = None
+    config: TrainConfig,
+    what: str,
+    resumed: tuple[Run, Checkpoint | None] | None = None,
+    source: Source = CUSTOM,
 ) -> int:
     """Train, print the result, and return the exit code."""
     console = make_console()
     try:
-        outcome = _fit(config, what, resumed, console)
+        outcome = _fit(config, what, resumed, source, console)
     except KeyboardInterrupt:  # during training, `Interrupt` defers signals
         console.print("stopped before training began: nothing was written")
         raise
@@ -139,15 +143,19 @@ def _fit(
     config: TrainConfig,
     what: str,
     resumed: tuple[Run, Checkpoint | None] | None,
+    source: Source,
     console: Console,
 ) -> Outcome:
     """Train with the live view; the trainer and the files that it maps are gone at the end."""
     with ExitStack() as stack:
         view = DurationView(console, _scale(config))
         with console.status("building the scene and timing this machine", spinner="line"):
-            trainer = stack.enter_context(Trainer(config, [view], resumed=resumed))
+            trainer = stack.enter_context(Trainer(config, [view], source=source, resumed=resumed))
         done = resumed[1].step if resumed and resumed[1] else 0
         console.print(_outlook(trainer.setup, what, done), highlight=False)
+        seconds = trainer.setup.timing.seconds(trainer.config)
+        if resumed is None and source.preset != "laptop" and seconds > DAY:
+            console.print("that is more than a day: --preset laptop is made for such a machine")
         return trainer.fit()
 
 
@@ -189,8 +197,6 @@ def _outlook(setup: Setup, what: str, done: int) -> str:
     has_images = not config.own_env and any(m.stacked for m in setup.spec.modalities.values())
     images = f" ({config.env.renderer} images)" if has_images else ""
     lines = [f"{what}: {duration(config, timing, done)}"]
-    if timing.seconds(config, done) > DAY and config.preset != "laptop":
-        lines.append("that is more than a day: --preset laptop is made for a machine like this one")
     lines += key_lines(config, setup.env)
     step = "ms per step" if timing.knows_env else "ms per step, without the environment"
     lines += [

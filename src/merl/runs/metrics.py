@@ -8,7 +8,6 @@ memory and written as soon as that is possible.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import errno
 import io
@@ -17,6 +16,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ TENSORBOARD_FOLDER = "tensorboard"
 _LOG = logging.getLogger(__name__)
 
 
-class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
+class MetricsWriter(AbstractContextManager["MetricsWriter"]):
     """Writer of the metrics of a run; a context manager.
 
     All rows are also held in memory (a few MB for the longest run). If a new column appears, rows
@@ -60,7 +60,7 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
         # Only here: a folder that is deleted during the run is not created again.
         self._guard(lambda: self._path.parent.mkdir(parents=True, exist_ok=True))
         self._guard(lambda: self._rewrite(None))
-        self._guard(self._open_events)
+        self._guard(self._event_file)
 
     def __exit__(self, *_: object) -> None:
         """Close the writer, also after an exception."""
@@ -104,8 +104,10 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
                 raise ValueError(f"a metric cannot be named {name!r}")
         new = [name for name in numbers if name not in self._columns]
 
-        begin = self._tail if step == last else self._end()
         file = self._take_file()
+        begin = self._tail
+        if file is not None and step != last:
+            begin = file.seek(0, io.SEEK_END)
         self._written = min(self._written, len(self._rows) - (step == last))
         if step != last:
             self._rows.append({"step": str(int(step))})
@@ -115,7 +117,7 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
             self._guard(lambda: self._rewrite(file))
         else:
             self._guard(lambda: self._put_last_row(file, begin))
-        self._guard(lambda: self._log_events(step, numbers))
+        self._guard(lambda: self._event_file().scalars(step, numbers))
 
     def trim(self, step: int) -> None:
         """Drop every row after `step`: call it when a run resumes from a checkpoint of `step`.
@@ -131,7 +133,7 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
             self._rows = kept
             self._written = min(self._written, len(kept))
             self._guard(lambda: self._rewrite(file))
-            self._guard(lambda: self._forget_events(step))
+            self._guard(lambda: self._event_file().forget_from(step + 1))
 
     def close(self) -> None:
         """Flush all metrics to disk and close the files; may be called twice."""
@@ -140,13 +142,14 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
         self._closed = True
         if self._file is None:
             self._guard(lambda: self._rewrite(None))
-        if self._file is not None:
-            self._guard(self._sync)
-            self._guard(self._file.close)
+        file = self._file
+        if file is not None:
+            self._guard(lambda: os.fsync(file.fileno()))
+            self._guard(file.close)
         if self._events is not None:
             self._guard(self._events.close)
 
-    def _guard(self, action: Callable[[], None]) -> None:
+    def _guard(self, action: Callable[[], object]) -> None:
         """Run a file operation; if it fails, warn the user once and continue."""
         try:
             action()
@@ -159,10 +162,6 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
                     "continues, and they are kept in memory until they can be written"
                 )
 
-    def _sync(self) -> None:
-        assert self._file is not None
-        os.fsync(self._file.fileno())
-
     def _take_file(self) -> io.FileIO | None:
         """Return the open file and set `_file` to None before the rows in memory change.
 
@@ -171,10 +170,6 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
         """
         file, self._file = self._file, None
         return file
-
-    def _end(self) -> int:
-        """Return the size of the file in bytes."""
-        return 0 if self._file is None else self._file.seek(0, io.SEEK_END)
 
     def _put_last_row(self, file: io.FileIO, begin: int) -> None:
         """Write the last row at byte `begin` in one write, and truncate the file after it."""
@@ -199,7 +194,8 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
                 os.fsync(file.fileno())
             temporary.replace(self._path)
         except OSError:
-            _remove(temporary)
+            with suppress(OSError):  # a disk that is not writable may also refuse to delete
+                temporary.unlink(missing_ok=True)
             raise
         self._file = io.FileIO(self._path, "r+")
         self._tail = sum(map(len, lines)) - len(lines[-1])
@@ -208,20 +204,10 @@ class MetricsWriter(contextlib.AbstractContextManager["MetricsWriter"]):
     def _cells(self, row: Mapping[str, str]) -> Iterable[str]:
         return (row.get(name, "") for name in self._columns)
 
-    def _open_events(self) -> None:
-        self._events = _EventFile(self._path.parent / TENSORBOARD_FOLDER)
-
-    def _log_events(self, step: int, values: Mapping[str, float]) -> None:
+    def _event_file(self) -> _EventFile:
         if self._events is None:
-            self._open_events()
-        assert self._events is not None
-        self._events.scalars(step, values)
-
-    def _forget_events(self, step: int) -> None:
-        if self._events is None:
-            self._open_events()
-        assert self._events is not None
-        self._events.forget_from(step + 1)
+            self._events = _EventFile(self._path.parent / TENSORBOARD_FOLDER)
+        return self._events
 
 
 class _EventFile:
@@ -319,8 +305,3 @@ def _write_whole(file: io.FileIO, data: bytes, begin: int) -> None:
     except OSError:
         file.truncate(begin)
         raise
-
-
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):  # a disk that is not writable may also refuse to delete
-        path.unlink(missing_ok=True)

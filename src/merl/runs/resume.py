@@ -46,8 +46,6 @@ _DECIDED = {
 }
 REOPENED = ("threads", "agent.precision", "agent.torch_compile")
 """Fields that are chosen again on another machine if the user left them open."""
-_NAMES = ("run_dir", "preset", "setting")
-"""Fields that only name the folder of the run or the source of other values."""
 
 
 def left_open(config: TrainConfig) -> tuple[str, ...]:
@@ -64,10 +62,7 @@ def reopened(config: TrainConfig, names: Iterable[str] = REOPENED) -> TrainConfi
 
 
 def decided(config: TrainConfig) -> TrainConfig:
-    """Return a config in which device, threads, precision and compilation have fixed values.
-
-    The values are arbitrary.
-    """
+    """Return a config in which device, threads, precision and compilation are not left open."""
     return _with_known(config, _DECIDED)
 
 
@@ -99,7 +94,7 @@ def merge_resume_config(
         name: (before.get(name), after.get(name))
         for name in {**before, **after}
         if before.get(name) != after.get(name)
-        and name not in _NAMES
+        and name != "run_dir"
         and not (recorded.own_env and name.startswith("env."))  # only for merl's own tasks
         and name != "minutes"  # counted since the resume
         and (name in given_open or name not in open_fields)

@@ -24,7 +24,7 @@ from gymnasium import spaces
 from merl.agents import find_agent
 from merl.agents.config import UnloadedConfig
 from merl.agents.networks import own_encoders
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, user_code
 from merl.envs.user_env import imports_code, load_module
 from merl.runs import record, trust
@@ -32,12 +32,7 @@ from merl.runs.plain import from_plain
 from merl.runs.provenance import machine
 from merl.runs.record import FORMAT, Bounds
 from merl.runs.resume import REOPENED
-from merl.runs.run_folder import (
-    create_folder,
-    discard_folder,
-    lock_folder,
-    refuse_existing,
-)
+from merl.runs.run_folder import create_folder, discard_folder, lock_folder, refuse_existing
 from merl.runs.trust import Origin
 
 
@@ -68,6 +63,7 @@ class Run:
         bounds: Bounds | None = None,
         left_open: tuple[str, ...] = REOPENED,
         *,
+        source: Source = CUSTOM,
         home: Path | None = None,
     ) -> Iterator[Run]:
         """Create the folder of a new run, lock it, and write its config; unlock it at the end.
@@ -79,13 +75,14 @@ class Run:
             bounds: the bounds of the environment's actions before rescaling; None if they are not
                 rescaled.
             left_open: names of the fields that the user left open.
+            source: where the config's values come from.
             home: see `run_path`.
 
         Raises:
             MerlError: the folder holds other files, cannot be created, or is in use by another
                 process.
         """
-        path, created = create_folder(config, home)
+        path, created = create_folder(config, source, home)
         run = cls(path, config, left_open, created)
         with ExitStack() as stack:
             try:
@@ -102,8 +99,7 @@ class Run:
                     "id": trust.identity(),
                     "task": config.task,
                     "agent": config.agent_name,
-                    "preset": config.preset,
-                    "setting": config.setting,
+                    **dataclasses.asdict(source),
                     "seed": config.seed,
                     **record.describe_config(config, left_open),
                     **record.describe_spaces(observation_space, action_space, bounds),

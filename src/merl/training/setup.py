@@ -20,7 +20,7 @@ from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
 from merl.agents.networks import make_networks, own_encoders
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import Agent, MerlError, counted, user_code
 from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.user_env import load_module
@@ -100,13 +100,14 @@ class Setup:
 
     @classmethod
     @contextmanager
-    def prepare(cls, config: TrainConfig, *, new: bool) -> Iterator[Setup]:
+    def prepare(cls, config: TrainConfig, *, new: bool, source: Source = CUSTOM) -> Iterator[Setup]:
         """Make environments and agent of a run, and check its config; write no files.
 
         Args:
             config: the config of the run.
             new: whether the run is new: its folder must not exist, its replay must fit, and the
                 modules of the user's environment and encoders may be in the working folder.
+            source: where the config's values come from; it names the folder of a new run.
 
         Raises:
             MerlError: a device, a renderer, an observation or a folder is not available, or a size
@@ -121,7 +122,7 @@ class Setup:
             )
         home = Path.cwd()  # before user code runs, which may change the working folder
         if new:
-            refuse_existing(run_path(config, home))
+            refuse_existing(run_path(config, source, home))
             if config.own_env and ":" in config.task:
                 load_module(config.task, home)
             for name in own_encoders(config.agent):
@@ -136,7 +137,7 @@ class Setup:
                 rings=config.num_envs,
             )
             if new:
-                check_fits(replay_spec, run_path(config, home))
+                check_fits(replay_spec, run_path(config, source, home))
             eval_env = None
             if config.eval.every:
                 size = max(config.env.render_size, MIN_SIDE)

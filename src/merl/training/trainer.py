@@ -13,7 +13,7 @@ from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.acting.run_env import own_bounds
 from merl.acting.workers import WorkerEnvs
 from merl.agents import load_initial_weights
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import (
     EnvironmentFailed,
     EnvironmentsLost,
@@ -76,6 +76,7 @@ class Trainer:
     Args:
         config: the run's config.
         callbacks: called at the events of training.
+        source: where the config's values come from; recorded with a new run.
         resumed: None for a new run; else the run to resume, whose lock the caller holds, and the
             checkpoint to resume from, or None to start at the first step.
 
@@ -98,10 +99,13 @@ class Trainer:
         config: TrainConfig,
         callbacks: Iterable[Callback] = (),
         *,
+        source: Source = CUSTOM,
         resumed: tuple[Run, Checkpoint | None] | None = None,
     ) -> None:
         with ExitStack() as stack:
-            self.setup = stack.enter_context(Setup.prepare(config, new=resumed is None))
+            self.setup = stack.enter_context(
+                Setup.prepare(config, new=resumed is None, source=source)
+            )
             setup = self.setup
             if resumed is not None:
                 bounds = own_bounds(setup.env)
@@ -109,7 +113,7 @@ class Trainer:
             if resumed is None or resumed[1] is None:
                 load_initial_weights(setup.agent, setup.home)
             self._resources = stack.pop_all()
-        self.config, self._resumed = setup.config, resumed
+        self.config, self._source, self._resumed = setup.config, source, resumed
         self._callbacks = CallbackList(callbacks)
         self._averages, self._guard = Averages(), LossGuard()
         self._worker_losses = 0
@@ -149,7 +153,13 @@ class Trainer:
         space, actions = setup.space, setup.action_space
         bounds = own_bounds(setup.env)
         with Run.begin(
-            self.config, space, actions, bounds, setup.left_open, home=setup.home
+            self.config,
+            space,
+            actions,
+            bounds,
+            setup.left_open,
+            source=self._source,
+            home=setup.home,
         ) as run:
             try:
                 return self._fit(run, None)

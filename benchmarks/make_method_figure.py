@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from gymnasium import spaces
 
-from merl.agents import make_agent
+from merl.agents.config import AgentConfig
+from merl.agents.networks import make_networks
 from merl.experiments.presets import compose
 
 OUTPUT = Path(__file__).resolve().parent.parent / "docs/images/method.svg"
@@ -82,29 +82,24 @@ def shapes() -> dict[str, str]:
             "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO,), np.float32),
         }
     )
-    networks = make_agent(
-        config.agent,
-        space,
-        spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32),
-        frame_stack=stack,
-        seed=0,
-        device=torch.device("cpu"),
-    ).networks
-    latent = config.agent.latent_dim
+    agent = config.agent
+    assert isinstance(agent, AgentConfig)
+    networks = make_networks(agent, space, ACTIONS, stack)
+    latent = agent.latent_dim
     return {
         "stack": f"{stack} x {size} x {size} x 3",
-        "pad": str(config.agent.shift_pad),
-        "convolutions": str(len(config.agent.conv_strides)),
+        "pad": str(agent.shift_pad),
+        "convolutions": str(len(agent.conv_strides)),
         "image": f"{networks.encoders.features['image']:,}",
         "proprio": str(networks.encoders.features["proprio"]),
         "fused": f"{latent // 2} + {latent // 2} = {latent}",
         "critic": f"{latent} + {ACTIONS}",
         "latent": str(latent),
-        "heads": f"{config.agent.head_layers} layers of {config.agent.hidden_dim:,}",
+        "heads": f"{agent.head_layers} layers of {agent.hidden_dim:,}",
         "batch": str(config.replay.batch_size),
         "steps": f"{config.replay.n_step}-step return",
-        "tau": str(config.agent.tau),
-        "noise": str(config.agent.noise_std),
+        "tau": str(agent.tau),
+        "noise": str(agent.noise_std),
         "capacity": f"{config.replay.capacity:,}",
     }
 

@@ -75,7 +75,8 @@ def compare(path: Path) -> None:
             other.copy_(theirs_from(mine))
     for update in range(4):
         batch, chance = CASE.batch_of(update, torch.float64), CASE.chance_of(update)
-        found = ours.learn(batch, draws_of(chance, CONFIG, torch.float64, CASE.step))
+        noise = draws_of(chance, CONFIG, torch.float64, CASE.step)
+        found = ours.update(batch, noise, step=CASE.step)
         losses = authors_update(theirs, utils, batch, chance)
         for name in ("critic_loss", "actor_loss"):
             print(f"update {update + 1}, {name}: {float(found[name]):.9f} and {losses[name]:.9f}")

@@ -42,7 +42,6 @@ from merl.envs import make_env
 from merl.networks.augmentation import RandomShift, draw_shifts
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, buffer, frames
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
-from merl.training.timing import use_threads
 
 ROOT = Path(__file__).resolve().parent.parent
 CSV, FIGURE = ROOT / "results/scaling.csv", ROOT / "docs/images/scaling.png"
@@ -79,7 +78,6 @@ def main(
     """
     ask = {"batch": batches, "image": sides, "environments": environments}
     print(circumstances())
-    use_threads(torch.get_num_threads())
     with CSV.open() as file:
         rows: list[Any] = list(csv.reader(file))[1:]
     for question in questions:

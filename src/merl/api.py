@@ -24,7 +24,7 @@ def train(
     task: str | TrainConfig,
     *,
     preset: str | None = None,
-    agent: str | None = None,
+    agent: str | type | None = None,
     setting: Setting = "matched",
     callbacks: Iterable[Callback] = (),
     **overrides: Any,
@@ -35,7 +35,8 @@ def train(
         task: one of merl's tasks, a Gymnasium id, or `module:function`; or a whole config.
         preset: the values that others override (`merl.experiments.presets.PRESETS`); if not given,
             `paper` on a machine with CUDA, else `laptop`. Ignored if `task` is a config.
-        agent: the agent's name; if not given, the preset's. Ignored if `task` is a config.
+        agent: the agent's name, or your own class of agent (docs/howto/agent.md); if not given, the
+            preset's. Ignored if `task` is a config.
         setting: `matched` (MERL's values) or `published` (those of the agent's authors). Ignored if
             `task` is a config.
         callbacks: called while it trains.
@@ -48,6 +49,8 @@ def train(
     Raises:
         MerlError: a value cannot work; or see `Trainer.fit`.
     """
+    if isinstance(agent, type):
+        agent = f"{agent.__module__}:{agent.__qualname__}"
     if isinstance(task, str):
         config = compose(preset or default_preset(), task, agent, setting)
     else:
@@ -77,13 +80,13 @@ def evaluate(
         video: record the first episode into this MP4 file.
         renderer: draws the images; if not given, the renderer of the training.
         max_episode_steps: cut an episode after this many steps; if not given, as in the run.
-        trust: import the environment that the run names although it was not trained on this
-            machine, which runs the code of whoever made the run.
+        trust: import the environment and the agent that the run names although it was not trained
+            on this machine, which runs the code of whoever made the run.
 
     Raises:
-        MerlError: the run cannot be loaded, or its environment is not trusted.
+        MerlError: the run cannot be loaded, or its code is not trusted.
     """
-    policy = load_policy(run, checkpoint=checkpoint)
+    policy = load_policy(run, checkpoint=checkpoint, trust=trust)
     return policy.evaluate(
         episodes=episodes,
         video=None if video is None else Path(video).absolute(),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import tyro
 
 from merl.agents import AGENTS
-from merl.agents.config import AgentConfig
+from merl.agents.config import ObservationConfig
 from merl.core import MerlError, check_choice, counted, suggest
 from merl.core.fields import NOT_EMPTY, Range, check_fields
 from merl.envs.config import EnvConfig, StartName, UserEnvConfig
@@ -72,7 +72,7 @@ class TrainConfig:
     preset: tyro.conf.Suppress[str] = "paper"
     """Set of default values for the other options: paper, laptop, state or smoke."""
     agent_name: tyro.conf.Suppress[str] = "merl"
-    """Name of the agent, which `agent` configures."""
+    """Name of the agent, which `agent` configures: a key of `AGENTS`, or `module:Class`."""
     setting: tyro.conf.Suppress[Setting] = "matched"
     """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
     (published)."""
@@ -123,14 +123,16 @@ class TrainConfig:
         default_factory=UserEnvConfig
     )
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    agent: AgentConfig = field(default_factory=lambda: AGENTS["merl"])
+    agent: ObservationConfig = field(default_factory=lambda: AGENTS["merl"].config)
     eval: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
         check_fields(self)
-        check_choice("agent", self.agent_name, tuple(AGENTS))
-        kind = type(AGENTS[self.agent_name])
-        if type(self.agent) is not kind:
+        own_agent = ":" in self.agent_name
+        if not own_agent:
+            check_choice("agent", self.agent_name, tuple(AGENTS))
+        kind = ObservationConfig if own_agent else type(AGENTS[self.agent_name].config)
+        if not isinstance(self.agent, kind) or not (own_agent or type(self.agent) is kind):
             raise MerlError(
                 f"agent {self.agent_name!r} needs a config of type {kind.__name__}, not "
                 f"{type(self.agent).__name__}"

@@ -17,12 +17,10 @@ import psutil
 import pytest
 from rich.filesize import decimal
 from safetensors.torch import load_file
-from torch import Tensor
 
 from helpers import flat, wait_for
 from merl import cli
-from merl.agents.ddpg import DDPG, UpdateNoise
-from merl.core import Batch
+from merl.agents.ddpg import DDPG
 from merl.report.curves import read_metrics
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
@@ -328,13 +326,13 @@ def test_environments_step_during_an_update(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each step of the environment waits for an update that starts during the step."""
-    learn = DDPG.learn
+    plan = DDPG.plan
 
-    def recording(self: DDPG, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
-        (tmp_path / f"learns-{self.step + 1}").touch()
-        return learn(self, batch, draws)
+    def recording(self: DDPG, step: int) -> Any:
+        (tmp_path / f"learns-{step + 1}").touch()
+        return plan(self, step)
 
-    monkeypatch.setattr(DDPG, "learn", recording)
+    monkeypatch.setattr(DDPG, "plan", recording)
     flags = ["--no-synchronous", "--updates-per-step", "1", "--worker-timeout", "600"]
     assert train(tmp_path / "run", "waits_for_update", *flags) == 0
     assert read_metrics(tmp_path / "run")["step"][-1] == 100

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
-from merl.agents.update_noise import UpdateNoise
-from merl.core import Batch
+from merl.agents.sac import SACConfig
+from merl.core import Batch, UpdateNoise
 
 STACK = 3
 ACTIONS = 6
@@ -82,7 +82,8 @@ class Case:
 
     def agent(self, seed: int = 0, actions: int = ACTIONS) -> DDPG:
         """Make the agent with the package."""
-        agent = make_agent(
+        return make_agent(
+            "sac" if isinstance(self.config, SACConfig) else "merl",
             self.config,
             self.observation_space,
             spaces.Box(-1, 1, (actions,), np.float32),
@@ -90,8 +91,12 @@ class Case:
             seed=seed,
             device=torch.device("cpu"),
         )
-        agent.step = self.step
-        return agent
+
+    def learn(
+        self, agent: DDPG, batch: Batch, noise: UpdateNoise | None = None
+    ) -> dict[str, Tensor]:
+        """Make an update at the step of the case."""
+        return agent.update(batch, noise, step=self.step)
 
     def batch_of(self, seed: int, dtype: torch.dtype = torch.float32) -> Batch:
         """Return a random batch, with discounts of zero and above zero."""

@@ -27,7 +27,7 @@ WITH_STATE = spaces.Dict({**SPACE, "state": spaces.Box(-np.inf, np.inf, (40,), n
 def make(config: MERLConfig, space: spaces.Dict = SPACE) -> DDPG:
     action_space = spaces.Box(-1, 1, (9,), np.float32)
     device = torch.device("cpu")
-    return make_agent(config, space, action_space, frame_stack=3, seed=0, device=device)
+    return make_agent("merl", config, space, action_space, frame_stack=3, seed=0, device=device)
 
 
 def test_defaults_are_those_of_table_1() -> None:
@@ -88,7 +88,7 @@ def test_share_of_a_modality_is_rounded_down() -> None:
         ({"frozen_encoders": ("wrist",)}, "agent.frozen-encoders names 'wrist'"),
         (
             {"encoders": {"image": "conv1d"}},
-            "'image': encoder 'conv1d' is not made for .* image: use conv, impala",
+            "'image': encoder 'conv1d' does not fit a key of kind image: choose from conv",
         ),
         ({"encoders": {"proprio": "ident"}}, "'ident' is unknown: did you mean 'identity'"),
         ({"encoder_weights": {"touch": "x"}}, "agent.encoder-weights names 'touch'"),
@@ -157,9 +157,9 @@ def test_observation_keys_may_have_any_name() -> None:
         "arm.joints": torch.zeros((1, 3)),
         "training": torch.zeros((1, 2)),
     }
-    assert agent.act(observation, explore=False).shape == (1, 9)
+    assert agent.act(observation, explore=False, step=0).shape == (1, 9)
     batch = Batch(
         observation, torch.zeros((1, 9)), torch.zeros(1), torch.ones(1), dict(observation)
     )
-    assert set(agent.draw(len(batch.action)).shifts) == {"type", "wrist camera"}
-    agent.update(batch)
+    assert set(agent.draw(len(batch.action), agent.plan(0)).shifts) == {"type", "wrist camera"}
+    agent.update(batch, step=0)

@@ -28,7 +28,11 @@ FEATURES = 32 * 5 * 5
 
 def ours(agent: str, layers: int) -> DDPG:
     config = dataclasses.replace(
-        AGENTS[agent], hidden_dim=WIDTH, head_layers=layers, precision="fp32", noise_std_end=None
+        AGENTS[agent].config,
+        hidden_dim=WIDTH,
+        head_layers=layers,
+        precision="fp32",
+        noise_std_end=None,
     )
     config = dataclasses.replace(config, noise_std=0.2)
     space = spaces.Dict(
@@ -39,7 +43,7 @@ def ours(agent: str, layers: int) -> DDPG:
     )
     box = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
     cpu = torch.device("cpu")
-    made = make_agent(config, space, box, frame_stack=3, seed=0, device=cpu)
+    made = make_agent(agent, config, space, box, frame_stack=3, seed=0, device=cpu)
     made.networks.double()
     made.critic_target.double()
     return made
@@ -119,7 +123,7 @@ def test_reference_and_agent_make_the_same_update(agent: str, layers: int) -> No
     sample = bench.as_sample(batch, vector=joints)
     swapped = [offset.flip(1) for offset in offsets]  # grid_sample counts columns first
     for _ in range(2):
-        losses = mine.learn(batch, draws)
+        losses = mine.update(batch, draws, step=0)
         critic_loss, actor_loss = plain.learn(sample, *noises, *swapped)
         torch.testing.assert_close(losses["critic_loss"], critic_loss, rtol=1e-8, atol=0)
         torch.testing.assert_close(losses["actor_loss"], actor_loss, rtol=1e-8, atol=0)

@@ -142,7 +142,8 @@ def test_evaluating_a_hostile_folder_imports_nothing_from_it(run: Path, tmp_path
     folder = tmp_path / "hostile"
     shutil.copytree(run, folder)
     record = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps(record | {"module_folder": str(folder)}))
+    record["module_folders"] = {"reach_duplo": str(folder)}
+    (folder / "config.json").write_text(json.dumps(record))
     for name in ("dm_control", "mujoco", "warp", "torch", "av", "rich", "sitecustomize"):
         (folder / name).mkdir()
         (folder / name / "__init__.py").write_text("open('imported', 'w')")

@@ -15,8 +15,8 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from merl.core import EnvironmentFailed, MerlError, NotFinite
+from merl.core.user_code import in_one_line
 from merl.envs.user_env import adapt, load_module, make_user_env
-from merl.envs.wrappers import in_one_line
 
 
 class SpaceEnv(gymnasium.Env[Any, Any]):
@@ -348,7 +348,7 @@ def test_errors_name_no_line_in_packages_merl_or_missing_files(tmp_path: Path) -
     installed = tmp_path / "lib" / "site-packages" / "driver.py"
     assert "driver.py" not in described_error(installed, code)
     assert described_error(tmp_path / "merl_arm.py", code).endswith("(merl_arm.py, line 2)")
-    with patch("merl.envs.wrappers.__file__", str(tmp_path / "merl" / "envs" / "wrappers.py")):
+    with patch("merl.core.user_code.__file__", str(tmp_path / "merl" / "core" / "user_code.py")):
         assert "dot.py" not in described_error(tmp_path / "merl" / "dot.py", code)
         assert described_error(tmp_path / "merl_arm" / "arm.py", code).endswith("(arm.py, line 2)")
     (tmp_path / "gone.py").write_text(code)

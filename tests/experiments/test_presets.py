@@ -64,7 +64,8 @@ def test_head_layers_of_preset_paper_depend_on_the_task(task: str, layers: int) 
 def test_every_preset_accepts_every_agent() -> None:
     for preset, chosen in PRESETS.items():
         assert compose(preset, "lift_box").agent_name == chosen.agent_name
-        for name, agent in AGENTS.items():
+        for name, kind in AGENTS.items():
+            agent = kind.config
             config = compose(preset, "lift_box", name)
             assert (config.preset, config.agent_name) == (preset, name)
             assert type(config.agent) is type(agent)
@@ -79,7 +80,7 @@ def test_setting_published_has_the_authors_values() -> None:
     # the noise falls over 500,000 actions of two steps each
     assert (drqv2.agent.noise(0), drqv2.agent.noise(500_000)) == (1.0, pytest.approx(0.55))
     assert drqv2.agent.noise(10**7) == pytest.approx(0.1)
-    assert drqv2.agent == dataclasses.replace(AGENTS["drqv2"], noise_steps=1_000_000)
+    assert drqv2.agent == dataclasses.replace(AGENTS["drqv2"].config, noise_steps=1_000_000)
     ddpg = compose("state", "reach_duplo", "ddpg", "published")
     assert (ddpg.agent.noise_std, ddpg.agent.noise_clip, ddpg.agent.hidden_dim) == (0.1, 0.0, 256)
     assert (ddpg.replay.n_step, ddpg.random_steps, ddpg.seed_steps) == (1, 25_000, 25_000)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from torch import Tensor
+from torch import Tensor, nn
 
 from merl.core import MerlError
-from merl.modalities import Image, Modality, Vector
+from merl.modalities import Depth, Image, Modality, Sequence, Vector
+from merl.networks.encoders import EncoderOptions, make_encoder
 from merl.networks.encoders.frames import ConvEncoder
+from merl.networks.encoders.pretrained import TimmEncoder, has_timm
 from merl.networks.encoders.vectors import Identity, MLPEncoder, Standardize
 from merl.networks.initialization import orthogonal
 from merl.networks.representation import Encoders
@@ -202,3 +206,168 @@ def test_each_modality_is_encoded_images_first() -> None:
     shifted = encoders(observation, {"front": middle, "wrist": middle - 2})
     assert torch.equal(shifted["front"], encoded["front"])
     assert not torch.equal(shifted["wrist"], encoded["wrist"])
+
+
+def depth(*shape: int) -> Depth:
+    return Depth(spaces.Box(0.0, 2.0, shape, np.float32))
+
+
+def history(samples: int, numbers: int) -> Sequence:
+    return Sequence(spaces.Box(-np.inf, np.inf, (samples, numbers), np.float32))
+
+
+OPTIONS = EncoderOptions(conv_channels=8, mlp_dim=16)
+FITTING: list[tuple[str, Modality]] = [
+    ("conv", image(24, 20, 3)),
+    ("conv", depth(24, 20, 1)),
+    ("impala", image(24, 21, 1)),
+    ("impala", depth(8, 8, 1)),
+    ("identity", vector(5)),
+    ("identity", history(4, 3)),
+    ("mlp", vector(5)),
+    ("mlp", history(4, 3)),
+    ("conv1d", history(1, 3)),
+    ("conv1d", history(50, 6)),
+    ("transformer", history(50, 6)),
+]
+
+
+@pytest.mark.parametrize(("name", "modality"), FITTING)
+def test_an_encoder_by_name_learns_from_what_it_encodes(name: str, modality: Modality) -> None:
+    torch.manual_seed(0)
+    encoder = make_encoder(name, modality, 3, OPTIONS)
+    orthogonal(encoder)
+    stored = modality.random(4, 3, torch.Generator().manual_seed(0))
+    taken = stored if hasattr(encoder, "takes_stored") else modality.to_input(stored)
+    encoded = encoder(taken)
+    assert encoded.shape == (4, encoder.features)
+    assert torch.isfinite(encoded).all()
+    assert not torch.allclose(encoded[0], encoded[1])
+    if list(encoder.parameters()):
+        encoded.square().sum().backward()
+        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in encoder.parameters())
+
+
+@pytest.mark.parametrize("name", ["conv1d", "transformer"])
+def test_the_order_of_a_history_matters(name: str) -> None:
+    torch.manual_seed(0)
+    modality = history(12, 3)
+    encoder = make_encoder(name, modality, 3, OPTIONS)
+    samples = torch.randn(2, 12, 3)
+    assert not torch.allclose(encoder(samples), encoder(samples.flip(1)), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "modality", "message"),
+    [
+        ("conv1d", image(24, 24, 3), "does not fit a key of kind image: choose from conv, impala"),
+        ("conv", vector(3), "does not fit a key of kind vector: choose from identity, mlp"),
+        ("impla", image(24, 24, 3), "did you mean 'impala'"),
+        ("resnet", history(3, 3), "choose from identity, mlp, conv1d, transformer, module:Class"),
+        ("impala", image(7, 24, 3), "7x24 pixels is too small for encoder impala"),
+        ("nowhere:Encoder", vector(3), "No module named 'nowhere'"),
+        (f"{__name__}:vector", vector(3), "has no class 'vector' that is a torch.nn.Module"),
+        (f"{__name__}:Short", vector(3), r"shape \(2, 3\) .* `features` is 4"),
+        (
+            f"{__name__}:Failing",
+            vector(3),
+            r"failed: ValueError: no cable \(test_enc",
+        ),
+    ],
+)
+def test_an_encoder_that_does_not_fit_is_refused(
+    name: str, modality: Modality, message: str
+) -> None:
+    with pytest.raises(MerlError, match=message):
+        make_encoder(name, modality, 3, OPTIONS)
+
+
+class Own(nn.Module):
+    """An encoder of a user, with an initialisation of its own."""
+
+    def __init__(self, modality: Modality, stack: int) -> None:
+        super().__init__()
+        self.features = 2
+        self.layer = nn.Linear(modality.shape[0], 2)
+        nn.init.constant_(self.layer.weight, 0.25)
+        self.seen = 0
+
+    def observe(self, values: Tensor) -> None:
+        self.seen += len(values)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return self.layer(values)
+
+
+class Short(Own):
+    def __init__(self, modality: Modality, stack: int) -> None:
+        super().__init__(modality, stack)
+        self.features = 4
+
+    def forward(self, values: Tensor) -> Tensor:
+        return values
+
+
+class Failing(Own):
+    def forward(self, values: Tensor) -> Tensor:
+        raise ValueError("no cable")
+
+
+def test_an_own_encoder_keeps_its_weights_and_sees_each_batch() -> None:
+    modality = vector(3)
+    encoder = make_encoder(f"{__name__}:Own", modality, 3, OPTIONS)
+    assert encoder.features == 2
+    encoders = Encoders({"joints": encoder}, {"joints": modality}, 0, standardize=False)
+    orthogonal(encoders)
+    assert (encoder.layer.weight == 0.25).all()
+    encoders.observe({"joints": torch.zeros(7, 3)})
+    assert encoder.seen == 7
+
+
+def test_standardisation_applies_to_vectors_and_histories() -> None:
+    modalities: dict[str, Modality] = {"joints": vector(2), "force": history(6, 3)}
+    parts = {key: Identity(modality) for key, modality in modalities.items()}
+    encoders = Encoders(parts, modalities, 0, standardize=True)
+    values = {"joints": 100 + torch.randn(500, 2), "force": 5 * torch.randn(500, 6, 3) - 40}
+    encoders.observe(values)
+    for encoded in encoders(values).values():
+        assert encoded.mean().abs() < 0.1
+        assert encoded.std() == pytest.approx(1, rel=0.1)
+
+
+timm = pytest.mark.skipif(not has_timm(), reason="timm is not installed")
+
+
+@timm
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_timm_model_encodes_each_frame(channels: int) -> None:
+    modality = image(64, 64, channels)
+    encoder = make_encoder("resnet18", modality, 2, OPTIONS)
+    assert encoder.features == 2 * 512
+    stacks = modality.to_input(noise(3, 2, 64, 64, channels))
+    encoded = encoder(stacks)
+    assert torch.equal(encoder.train()(stacks), encoded)  # the statistics are fixed
+    swapped = encoder(stacks.unflatten(1, (2, channels)).flip(1).flatten(1, 2))
+    torch.testing.assert_close(swapped, encoded.roll(512, 1))
+    with pytest.raises(MerlError, match="one or three channels, not 4"):
+        make_encoder("resnet18", image(64, 64, 4), 2, OPTIONS)
+
+
+@timm
+def test_a_timm_model_takes_its_weights_from_a_local_file(tmp_path: Path) -> None:
+    one, other = (make_encoder("resnet18", image(64, 64, 3), 1, OPTIONS) for _ in range(2))
+    assert isinstance(one, TimmEncoder)
+    assert isinstance(other, TimmEncoder)
+    file = tmp_path / "weights.pt"
+    torch.save(other.model.state_dict(), file)
+    one.load(file)
+    orthogonal(one)
+    for mine, theirs in zip(one.parameters(), other.parameters(), strict=True):
+        assert torch.equal(mine, theirs)
+    larger = make_encoder("resnet34", image(64, 64, 3), 1, OPTIONS)
+    assert isinstance(larger, TimmEncoder)
+    with pytest.raises(MerlError, match="are of another model"):
+        larger.load(file)
+    file.write_bytes(b"no weights")
+    with pytest.raises(MerlError, match="of encoder 'resnet18'"):
+        one.load(file)

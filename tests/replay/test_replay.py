@@ -23,10 +23,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from helpers import wait_for
+from merl.accelerate.device_replay import DeviceReplay
 from merl.core import Batch, MerlError, Observation, Transition
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, check_fits, frames
 from merl.replay.frames import ReadAhead
-from merl.replay.on_device import OnDevice
 from merl.replay.ring import EpisodeRing
 from merl.replay.spec import KeySpec, span_name
 
@@ -1087,7 +1087,7 @@ def test_frames_of_any_type_are_stored_and_stacked_exactly(tmp_path, storage):
             else:
                 replay.add(Transition(act(ring, t - 1), 0.0, 1.0, typed(ring, t), False), ring)
     if storage == "device":
-        copy = OnDevice(replay, torch.device("cpu"))
+        copy = DeviceReplay(replay, torch.device("cpu"))
         copy.follow()
         batch = copy.sample(64, torch.Generator().manual_seed(0))
     else:

@@ -164,7 +164,7 @@ def test_merls_own_tasks_use_the_state_only_if_it_is_named() -> None:
         "images used: image (32 x 32 x 3, from 0 to 255)",
         "vectors used: proprio (24 numbers)",
     ]
-    assert AGENTS["ddpg"].keys == compose("smoke", "reach_duplo", "ddpg").agent.keys
+    assert AGENTS["ddpg"].config.keys == compose("smoke", "reach_duplo", "ddpg").agent.keys
 
 
 def test_a_run_prints_its_keys_and_resumes_with_them(

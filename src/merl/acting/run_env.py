@@ -16,7 +16,7 @@ from gymnasium.wrappers import FilterObservation
 
 from merl.acting.env_checks import refuse_running_statistics
 from merl.acting.generators import global_state, set_global_state
-from merl.agents.config import AgentConfig
+from merl.agents.config import ObservationConfig
 from merl.agents.networks import observation_spec
 from merl.config import TrainConfig
 from merl.core import Kind, MerlError
@@ -255,7 +255,7 @@ def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any]
         env.unwrapped.np_random.bit_generator.state = own
 
 
-def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[ObservationKey, ...]:
+def _asked_for(agent: ObservationConfig, env: EnvConfig) -> tuple[ObservationKey, ...]:
     """Return the observations of a Jaco environment that the agent needs.
 
     These are the keys that the agent names; if it names none, those of the config. `state` is used

@@ -1,9 +1,10 @@
-"""Config of an agent: its networks and how it learns. Each agent is a choice of these values."""
+"""Config of an agent: the keys that it observes, its networks, and how it learns."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from merl.core import Kind, MerlError
 from merl.core.fields import NOT_EMPTY, Range, check_fields
@@ -26,8 +27,8 @@ Share = Annotated[float, Range(0, 1, without=0)]
 
 
 @dataclass(frozen=True)
-class AgentConfig:
-    """Networks of an agent and how it learns; the defaults are from Table 1 and Appendix C.1."""
+class ObservationConfig:
+    """Base of every agent's config: the keys that it observes."""
 
     keys: tuple[str, ...] | None = None
     """Observation keys to use; if not set, every key of the kinds in `modalities`, except the
@@ -37,6 +38,26 @@ class AgentConfig:
     privileged: tuple[str, ...] = ()
     """Keys that only the critic observes, e.g. `state`: known in training only (asymmetric
     critic)."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "agent.")
+
+
+@dataclass(frozen=True)
+class UnloadedConfig(ObservationConfig):
+    """Config of a user's agent, as recorded in a run, before the agent's code is imported."""
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    """Every recorded value, by name."""
+
+
+@dataclass(frozen=True)
+class AgentConfig(ObservationConfig):
+    """Networks of an agent and how it learns; the defaults are from Table 1 and Appendix C.1.
+
+    Each agent of merl is a choice of these values.
+    """
+
     encoders: dict[str, str] = field(default_factory=dict)
     """Encoder of a key, by its name (`--agent.encoders.wrist impala`): conv, impala or a model of
     timm for images; identity, mlp, conv1d or transformer for numbers; or `module:Class`. If not
@@ -123,8 +144,13 @@ class AgentConfig:
     which tries it once on a GPU in a long run, and keeps it if it is faster."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "agent.")
+        super().__post_init__()
         self._check_histogram()
+        if self.privileged and self.fusion != "decoupled":
+            raise MerlError(
+                f"agent.privileged {self.privileged} needs separate fusions for critic and actor: "
+                f"use --agent.fusion decoupled instead of {self.fusion}"
+            )
         for name in ("fusion", "fusion_norm", "fusion_layer"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):
                 raise MerlError(

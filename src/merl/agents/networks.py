@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from merl.agents.config import AgentConfig
+from merl.agents.config import AgentConfig, ObservationConfig
 from merl.core import MerlError
 from merl.modalities import Modality, ObservationSpec, modalities_of
 from merl.networks.critic import TwinCritic
@@ -117,6 +117,8 @@ def make_networks(
         MerlError: the space lacks a key that the agent uses, or the config does not fit the space.
     """
     spec = observation_spec(config, space, stack)
+    for name in ("encoders", "encoder_weights", "frozen_encoders"):
+        _named(name.replace("_", "-"), tuple(getattr(config, name)), spec.modalities)
     options = EncoderOptions(config.conv_channels, config.conv_strides, config.mlp_dim)
     encoders = Encoders(
         {key: _encoder(config, key, m, stack, options) for key, m in spec.modalities.items()},
@@ -142,7 +144,7 @@ def make_networks(
     return networks
 
 
-def observation_spec(config: AgentConfig, space: spaces.Dict, stack: int) -> ObservationSpec:
+def observation_spec(config: ObservationConfig, space: spaces.Dict, stack: int) -> ObservationSpec:
     """Return what the agent observes, checked against the space.
 
     Args:
@@ -168,19 +170,14 @@ def observation_spec(config: AgentConfig, space: spaces.Dict, stack: int) -> Obs
             )
     if not keys:
         raise MerlError(_nothing_to_use(config, space, given))
-    if privileged and config.fusion != "decoupled":
-        raise MerlError(
-            f"agent.privileged {privileged} needs separate fusions for critic and actor: use "
-            f"--agent.fusion decoupled instead of {config.fusion}"
-        )
     used = {key: m for key, m in given.items() if key in keys}
     used |= {key: given[key] for key in privileged}
-    for name in ("encoders", "encoder_weights", "frozen_encoders"):
-        _named(name.replace("_", "-"), tuple(getattr(config, name)), used)
     return ObservationSpec(used, privileged, stack)
 
 
-def _nothing_to_use(config: AgentConfig, space: spaces.Dict, given: Mapping[str, Modality]) -> str:
+def _nothing_to_use(
+    config: ObservationConfig, space: spaces.Dict, given: Mapping[str, Modality]
+) -> str:
     """Return an error message for an actor without keys."""
     what = f"the agent can use no observation among {sorted(space)}"
     if config.keys == ():
@@ -253,8 +250,20 @@ def _encoder(
         raise MerlError(f"observation {key!r}: {error}") from None
 
 
-def load_encoder_weights(networks: Networks, config: AgentConfig) -> None:
+def own_encoders(config: ObservationConfig) -> tuple[str, ...]:
+    """Return the encoders that a config names as `module:Class`."""
+    if not isinstance(config, AgentConfig):
+        return ()
+    return tuple(name for name in config.encoders.values() if ":" in name)
+
+
+def load_encoder_weights(networks: Networks, config: AgentConfig, home: Path) -> None:
     """Load the weights that the config names into the encoders of a new agent.
+
+    Args:
+        networks: networks of the agent.
+        config: config of the agent.
+        home: the folder to which the names of the files are relative.
 
     Raises:
         MerlError: a file cannot be read, or the encoder is not a model of timm.
@@ -266,7 +275,7 @@ def load_encoder_weights(networks: Networks, config: AgentConfig) -> None:
                 f"agent.encoder-weights names {key!r}, whose encoder is not a model of timm: name "
                 f"one with --agent.encoders.{key}, e.g. resnet18"
             )
-        encoder.load(Path(file))
+        encoder.load(home / file)
 
 
 def _named(field: str, keys: tuple[str, ...], given: Mapping[str, Modality]) -> tuple[str, ...]:

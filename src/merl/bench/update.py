@@ -17,16 +17,18 @@ from gymnasium import spaces
 from rich.table import Table
 from torch import Tensor
 
+from merl.accelerate.device_replay import DeviceReplay
+from merl.accelerate.networks import speed_up
+from merl.accelerate.recording import Recorded, UpdateOnDevice
 from merl.agents import AGENTS, make_agent
+from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
 from merl.bench.plain import Encoder, Plain, Sample
 from merl.core import Batch, MerlError, Transition, counted
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
-from merl.replay.on_device import OnDevice
 from merl.training.setup import choose_device
 from merl.training.timing import Arithmetic
-from merl.training.updating import Recorded, UpdateOnDevice
 
 SIDE, STACK, PROPRIO, ACTIONS, LAYERS = 84, 3, 24, 9, 6
 REFERENCE, OURS, DRQV2, OUR_DRQV2, SB3 = (
@@ -80,7 +82,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
 
     result: dict[str, Any] = {"repeats": repeats, "batch_size": batch_size} | circumstances()
     batch = noise_batch(batch_size).to(device)
-    replay = OnDevice(noise_replay(), device) if on_gpu else None
+    replay = DeviceReplay(noise_replay(), device) if on_gpu else None
     sides: dict[str, Work] = {}
     of: dict[str, str] = {}
     for reference, ours, agent in ((REFERENCE, OURS, "merl"), (DRQV2, OUR_DRQV2, "drqv2")):
@@ -89,7 +91,7 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
         sides[reference] = repeated(partial(plain.update, sample))
         for precision in ("fp32", "bf16"):
             name, learner = f"{ours}, {precision}", learner_of(agent, precision, device)
-            sides[name] = repeated(partial(learner.update, batch))
+            sides[name] = repeated(partial(learner.update, batch, step=0))
             of[name] = reference
             if replay is None:
                 continue
@@ -100,13 +102,13 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
                 update = UpdateOnDevice(learner, replay, batch_size, seed=0)
                 try:
                     for _ in range(Recorded.WARM_UP + 1):
-                        update()
+                        update(0)
                 except Exception as error:
                     if not compiled:
                         raise
                     result["not_compiled"] = f"{whole}: {type(error).__name__}"
                     continue
-                sides[whole], of[whole] = repeated(update), reference
+                sides[whole], of[whole] = repeated(partial(update, 0)), reference
     try:
         sides[SB3] = repeated(_stable_baselines(batch_size, device))
         of[SB3], result["stable_baselines"] = REFERENCE, SB3_DIFFERS
@@ -186,11 +188,18 @@ def learner_of(
     compiled: bool = False,
 ) -> DDPG:
     """Return merl's agent in the size that is timed, for images of `side` x `side` pixels."""
-    config = Arithmetic(precision, torch.get_num_threads(), compiled).decided(AGENTS[agent])
+    arithmetic = Arithmetic(precision, torch.get_num_threads(), compiled)
+    config = arithmetic.decided(AGENTS[agent].config)
+    assert isinstance(config, AgentConfig)
     if agent == "merl":
         config = dataclasses.replace(config, head_layers=LAYERS)
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
-    return make_agent(config, space_of(side), actions, frame_stack=STACK, seed=0, device=device)
+    learner = make_agent(
+        agent, config, space_of(side), actions, frame_stack=STACK, seed=0, device=device
+    )
+    assert isinstance(learner, DDPG)
+    speed_up(learner)
+    return learner
 
 
 def noise_replay(steps: int = 2000) -> ReplayBuffer:

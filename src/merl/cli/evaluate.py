@@ -59,9 +59,9 @@ def evaluate(args: list[str]) -> int:
     # Resolve paths before user code runs: it may change the working folder.
     json_file, video_file = _absolute(options.json), _absolute(options.video)
     console = make_console()
-    policy = load_policy(options.run, checkpoint=options.checkpoint)
     if options.trust:
         tell_trusted(Run.open(options.run))
+    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
     result = policy.evaluate(
         episodes=options.episodes,
         video=video_file,

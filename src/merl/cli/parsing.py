@@ -23,7 +23,7 @@ def parse(
     args: list[str],
     default: T | None = None,
     *,
-    partial: bool = False,
+    rest: list[str] | None = None,
 ) -> T:
     """Parse arguments with tyro.
 
@@ -32,7 +32,7 @@ def parse(
         prog: the name of the command, for help and errors.
         args: the arguments after the command's name.
         default: an instance with the default values.
-        partial: ignore arguments that belong to other options.
+        rest: gets the arguments that belong to other options; None: there must be none.
 
     Raises:
         MerlError: the arguments are invalid; the message is one line.
@@ -48,10 +48,11 @@ def parse(
             raise MerlError(message) from None
 
     with _errors.on_parse_error(fail):
-        if partial:
-            found, _ = tyro.cli(
+        if rest is not None:
+            found, others = tyro.cli(
                 options, prog=prog, args=args, add_help=False, return_unknown_args=True
             )
+            rest += others
             return found
         given: Any = tyro.MISSING_NONPROP if default is None else default
         parsed: T = tyro.cli(options, prog=prog, args=args, default=given)

@@ -30,8 +30,8 @@ class ResumeOptions:
     device: Device | None = None
     """Where the networks live from now on; by default where they were before."""
     trust: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Import the environment that the run names, although you have not trained this run here. This
-    runs the code of the run's author."""
+    """Import the environment and the agent that the run names, although you have not trained this
+    run here. This runs the code of the run's author."""
 
     def __post_init__(self) -> None:
         check_fields(self, "--")
@@ -41,12 +41,13 @@ def resume(args: list[str]) -> int:
     """Resume a run: merl resume RUN [--steps N] [--minutes N]."""
     options = parse(ResumeOptions, "merl resume", args)
     run = Run.open(options.run)
+    if options.trust:
+        tell_trusted(run)
+    run = run.with_agent(trusted=options.trust)
     asked = dataclasses.replace(
         reopened(run.config),
         steps=options.steps or run.config.steps,
         minutes=options.minutes,
         device=options.device or run.config.device,
     )
-    if options.trust:
-        tell_trusted(run)
     return go_on(run, asked, ["device"], trusted=options.trust)

@@ -6,11 +6,12 @@ import dataclasses
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from merl.agents import AGENTS
+from merl.agents.config import ObservationConfig
 from merl.cli.parsing import parse
 from merl.cli.running import begin, go_on
 from merl.config import Setting, TrainConfig, flat
@@ -29,9 +30,9 @@ class Choice:
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
     """Set of default values for the other options: paper (Table 1, for a machine with CUDA), laptop
     (2 cores without a GPU), state (from the simulator's state) or smoke (a test in a minute)."""
-    agent: Annotated[str | None, tyro.conf.arg(metavar="|".join(AGENTS))] = None
+    agent: Annotated[str | None, tyro.conf.arg(metavar="|".join([*AGENTS, "MODULE:CLASS"]))] = None
     """Agent and the observations that it uses. merl: camera and joints; drqv2: camera; proprio:
-    joints; merl_state, ddpg, sac: state."""
+    joints; merl_state, ddpg, sac: state; module:Class: your own."""
     setting: Setting = "matched"
     """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
     (published)."""
@@ -57,13 +58,15 @@ class _First(Choice):
 
 def train(args: list[str]) -> int:
     """Train an agent: merl train TASK [--preset paper|laptop|state|smoke] [--steps N] ..."""
-    first = parse(_First, PROG, args, partial=True)
+    rest: list[str] = []
+    first = parse(_First, PROG, args, rest=rest)
     preset = default_preset() if first.preset is None else first.preset
     composed = partial(compose, preset, agent=first.agent, setting=first.setting)
 
     def options(default: TrainConfig) -> TrainOptions:
         choice = Choice(preset, default.agent_name, first.setting)
-        without_task = dataclasses.replace(default, task=tyro.MISSING)
+        agent = dataclasses.replace(default.agent, **_by_key(rest, default.agent))
+        without_task = dataclasses.replace(default, task=tyro.MISSING, agent=agent)
         return parse(TrainOptions, PROG, args, default=TrainOptions(choice, without_task))
 
     default, given_open = composed("reach_duplo"), set[str]()
@@ -78,10 +81,27 @@ def train(args: list[str]) -> int:
         if config.run_dir is None:
             raise MerlError("--resume needs --run-dir: name the folder of the run to resume")
         if (config.run_dir / CONFIG_FILE).exists():
-            return go_on(Run.open(config.run_dir), config, given_open, named_in=Path.cwd())
+            run = Run.open(config.run_dir)
+            if run.config.agent_name == config.agent_name:  # otherwise `go_on` refuses
+                run = run.with_agent(named_in=Path.cwd())
+            return go_on(run, config, given_open, named_in=Path.cwd())
     why = "CUDA is available" if preset == "paper" else "CUDA is not available"
     reason = why if first.preset is None else "as requested"
     return begin(config, f"preset {preset} ({reason}; {PRESETS[preset].about})")
+
+
+def _by_key(args: list[str], agent: ObservationConfig) -> dict[str, Any]:
+    """Return the agent's options for single keys, `--agent.encoders.KEY`, with empty values.
+
+    tyro makes a flag for each key of a default, and the user's environment defines the keys.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for field in ("encoders", "encoder_weights"):
+        start = f"--agent.{field.replace('_', '-')}."
+        keys = [arg.partition("=")[0].removeprefix(start) for arg in args if arg.startswith(start)]
+        if keys and hasattr(agent, field):
+            found[field] = dict.fromkeys(keys, "")
+    return found
 
 
 def _refuse_foreign(config: TrainConfig, default: TrainConfig) -> None:

@@ -14,6 +14,7 @@ from merl.core.errors import (
 from merl.core.types import (
     CONFIG_FILE,
     METRICS_FILE,
+    Accelerable,
     Agent,
     Batch,
     FrameTransform,
@@ -21,11 +22,14 @@ from merl.core.types import (
     Kind,
     Observation,
     Transition,
+    UpdateNoise,
+    UpdatePlan,
 )
 
 __all__ = [
     "CONFIG_FILE",
     "METRICS_FILE",
+    "Accelerable",
     "Agent",
     "Batch",
     "EnvironmentFailed",
@@ -39,6 +43,8 @@ __all__ = [
     "NotSaved",
     "Observation",
     "Transition",
+    "UpdateNoise",
+    "UpdatePlan",
     "check_choice",
     "counted",
     "suggest",

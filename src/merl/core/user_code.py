@@ -14,9 +14,16 @@ from types import ModuleType
 from merl.core.errors import MerlError
 from merl.core.python_path import set_value, users_value
 
+FORMS = {
+    "task": "module:function, for example my_robot:make_env for my_robot.py",
+    "agent": "module:Class, for example my_agent:MyAgent for my_agent.py",
+    "encoder": "module:Class, for example my_robot:WristEncoder for my_robot.py",
+}
+"""The expected form of a name, by what the name stands for."""
+
 
 def load_module(
-    named: str, *folders: Path, kind: str, form: str, advice: str | None = None
+    named: str, *folders: Path, kind: str = "task", advice: str | None = None
 ) -> ModuleType:
     """Import the module of `module:name`.
 
@@ -25,8 +32,7 @@ def load_module(
         folders: folders that are searched first. The folder with the module is appended to
             `sys.path`, so that the module can import its neighbours, while all other imports are
             found where they were before.
-        kind: what the name stands for, for messages: "task" or "agent".
-        form: the expected form of a name, with an example, for messages.
+        kind: what the name stands for, for messages: a key of `FORMS`.
         advice: how to get a missing module; None: to add its folder to the search path.
 
     Raises:
@@ -34,7 +40,7 @@ def load_module(
     """
     module = named.partition(":")[0]
     if not all(part.isidentifier() for part in module.split(".")):
-        raise MerlError(f"{kind} {named!r}: use {form}")
+        raise MerlError(f"{kind} {named!r}: use {FORMS[kind]}")
     try:
         set_value(users_value())  # the module may start Python processes that need the folder
         any(_load_from(folder, module.partition(".")[0]) for folder in folders)

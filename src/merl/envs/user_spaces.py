@@ -57,8 +57,8 @@ class UserKey:
         """
         name = f"observation {self.key!r}"
         array = to_array(name, value)
-        if (*array.shape, 1) == self.given.shape:
-            array = array[..., None]
+        if self._is_same_but_for_axes_of_one(array):
+            array = array.reshape(self.given.shape)
         if array.shape != self.given.shape:
             raise EnvironmentFailed(
                 f"{name} has shape {array.shape}, but its space has {self.given.shape}"
@@ -79,6 +79,13 @@ class UserKey:
                 "other units, or clip it"
             )
         return floats
+
+    def _is_same_but_for_axes_of_one(self, array: NDArray[Any]) -> bool:
+        """Return whether the shape differs only by axes of length one: (H, W) and (H, W, 1)."""
+        one, other = (
+            [side for side in shape if side != 1] for shape in (array.shape, self.given.shape)
+        )
+        return one == other
 
     def _as_pixels(self, name: str, array: NDArray[Any]) -> NDArray[Any]:
         space, (low, high) = self.modality.space, self.bounds

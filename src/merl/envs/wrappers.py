@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import logging
 import signal
-import sysconfig
-import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -17,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.core import EnvironmentFailed, MerlError, NotFinite, counted
+from merl.core.user_code import in_one_line
 from merl.envs.config import UserEnvConfig
 from merl.envs.user_spaces import UserKey, action_bounds, advice, brief, is_depth, user_key
 from merl.envs.user_values import shown, to_bool, to_info, to_number
@@ -205,35 +203,6 @@ def failing(what: str) -> Iterator[None]:
 def _ctrl_c_raises() -> bool:
     """Return whether Ctrl-C raises KeyboardInterrupt; else the environment itself raised it."""
     return signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def in_one_line(error: BaseException) -> str:
-    """Return an exception's type and text, and the last line in the user's files that led to it."""
-    try:
-        text = " ".join(str(error).split())
-    except Exception:  # the exception's own __str__ may fail
-        text = ""
-    kind = type(error).__name__
-    described = f"{kind}: {text}" if text else kind
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if _is_users(frame.filename):
-            return f"{described} ({Path(frame.filename).name}, line {frame.lineno})"
-    return described
-
-
-def _is_users(filename: str) -> bool:
-    """Return whether code is in an existing file outside Python, installed packages and merl."""
-    path = Path(filename)
-    if filename.startswith("<") or not path.is_file():
-        return False
-    path = path.resolve()
-    names = ("stdlib", "platstdlib", "purelib", "platlib")
-    libraries = [Path(sysconfig.get_path(name)).resolve() for name in names]
-    libraries.append(Path(__file__).resolve().parents[1])
-    return not (
-        any(path.is_relative_to(library) for library in libraries)
-        or {"site-packages", "dist-packages"} & {*path.parts}
-    )
 
 
 def _unpacked(what: str, given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:

@@ -24,7 +24,7 @@ from merl.envs.user_spaces import UserKey
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.video import MIN_SIDE
 from merl.modalities import modalities_of
-from merl.runs.checkpoint import Checkpoint, load_networks, readable
+from merl.runs.checkpoint import Checkpoint, load_policy_of, readable
 from merl.runs.run import Run
 
 _LOG = logging.getLogger(__name__)
@@ -85,7 +85,7 @@ class Policy:
         else:
             self._stack.push(sensed)
         self._fresh = False
-        action = self._agent.act(self._stack.observation(), explore=False)[0]
+        action = self._agent.act(self._stack.observation(), explore=False, step=self.step)[0]
         result: NDArray[np.float32] = action.to("cpu", torch.float32).numpy()
         return result
 
@@ -187,9 +187,15 @@ class Policy:
 
 
 def load_policy(
-    run: str | Path, *, checkpoint: str | int = "latest", threads: int | None = 1
+    run: str | Path,
+    *,
+    checkpoint: str | int = "latest",
+    threads: int | None = 1,
+    trust: bool = False,
 ) -> Policy:
-    """Load the policy of a run; no code of the run is imported or executed.
+    """Load the policy of a run.
+
+    No code of the run is imported or executed, except that of a user's own agent.
 
     Args:
         run: the folder of the run.
@@ -197,9 +203,12 @@ def load_policy(
         threads: CPU threads that compute an action; None uses torch's setting. For a single
             observation, several threads mostly wait for each other. Torch's setting for the rest of
             the program is restored after each action.
+        trust: import a user's own agent that the run names, although you have not trained this run
+            on this machine. This runs code of the author of the run.
 
     Raises:
-        MerlError: there is no run or no complete checkpoint in it, or `threads` is not possible.
+        MerlError: there is no run or no complete checkpoint in it, `threads` is not possible, or
+            the run's own agent is not trusted.
     """
     most = os.cpu_count() or 1
     if threads is not None and (type(threads) is not int or not 1 <= threads <= most):
@@ -207,13 +216,15 @@ def load_policy(
             f"threads is {threads!r}: give None, or an integer from 1 to {most}, the number of "
             "CPUs of this machine"
         )
-    opened = Run.open(Path(run))
+    opened = Run.open(Path(run)).with_agent(trusted=trust)
+    opened.load_encoders(trusted=trust)
     saved = Checkpoint.find(opened.checkpoints, str(checkpoint))
     config, device = opened.config, torch.device("cpu")
     if config.device == "cuda" and torch.cuda.is_available():
         device = torch.device("cuda")
     observation_space, action_space = opened.spaces()
     agent = make_agent(
+        config.agent_name,
         config.agent,
         observation_space,
         action_space,
@@ -222,7 +233,7 @@ def load_policy(
         device=device,
         threads=threads,
     )
-    load_networks(agent.networks, saved)
+    load_policy_of(agent, saved)
     with readable(saved):
         reports_success = bool(saved.state()["progress"].get("reports_success", False))
     return Policy(

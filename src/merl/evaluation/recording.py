@@ -13,8 +13,8 @@ import numpy as np
 
 from merl.acting.rollout import Episode
 from merl.core import MerlError
+from merl.core.user_code import in_one_line
 from merl.envs.frame_rate import frame_rate
-from merl.envs.wrappers import in_one_line
 from merl.evaluation.video import FPS, Value, VideoWriter
 
 

@@ -7,6 +7,7 @@ import os
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,11 @@ from gymnasium import spaces
 
 import merl
 from merl.agents import AGENTS
+from merl.agents.config import ObservationConfig, UnloadedConfig
 from merl.config import TrainConfig
 from merl.core import CONFIG_FILE, MerlError, check_choice
-from merl.envs.user_env import module_folder
+from merl.core.user_code import module_folder
+from merl.runs import trust
 from merl.runs.plain import box, describe, from_plain, to_plain, told
 from merl.runs.provenance import commit, machine, package_versions
 from merl.runs.run_folder import PART, holds_nothing, program
@@ -28,11 +31,12 @@ Bounds = tuple[list[float], list[float]]
 
 def describe_config(config: TrainConfig, left_open: tuple[str, ...]) -> dict[str, Any]:
     """Return the part of a record that a resume replaces."""
-    folder = module_folder(config.task)
+    plain = to_plain(config)
+    folders = {name: module_folder(name) for name in trust.names(plain).values()}
     return {
-        "config": to_plain(config),
+        "config": plain,
         "left_open": list(left_open),
-        "module_folder": None if folder is None else str(folder),
+        "module_folders": {name: str(at) for name, at in folders.items() if at is not None},
     }
 
 
@@ -87,10 +91,18 @@ def write(folder: Path, record: Mapping[str, Any]) -> None:
 
 
 def config_of(record: Mapping[str, Any]) -> TrainConfig:
-    """Return the config; the agent's name selects the class of the agent's config."""
-    name = record["config"]["agent_name"]
+    """Return the config; the agent's name selects the class of the agent's config.
+
+    That of a user's own agent is an `UnloadedConfig`.
+    """
+    plain, name = record["config"], record["config"]["agent_name"]
+    if isinstance(name, str) and ":" in name:
+        values = plain["agent"]
+        keys = {field.name: values[field.name] for field in fields(ObservationConfig)}
+        plain = {**plain, "agent": {**keys, "values": values}}
+        return from_plain(TrainConfig, plain, agent=UnloadedConfig)
     check_choice("agent", name, tuple(AGENTS))
-    return from_plain(TrainConfig, record["config"], agent=type(AGENTS[name]))
+    return from_plain(TrainConfig, plain, agent=type(AGENTS[name].config))
 
 
 def spaces_of(record: Mapping[str, Any]) -> tuple[spaces.Dict, spaces.Box]:

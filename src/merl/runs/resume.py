@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from merl.config import TrainConfig, flat, override
@@ -53,12 +53,14 @@ _NAMES = ("run_dir", "preset", "setting")
 def left_open(config: TrainConfig) -> tuple[str, ...]:
     """Return the names of the fields that a config leaves open."""
     values = flat(config)
-    return tuple(name for name, value in _LEFT_OPEN.items() if values[name] == value)
+    return tuple(
+        name for name, value in _LEFT_OPEN.items() if name in values and values[name] == value
+    )
 
 
 def reopened(config: TrainConfig, names: Iterable[str] = REOPENED) -> TrainConfig:
     """Return a config in which the named fields are open again."""
-    return override(config, {name: _LEFT_OPEN[name] for name in names})
+    return _with_known(config, {name: _LEFT_OPEN[name] for name in names})
 
 
 def decided(config: TrainConfig) -> TrainConfig:
@@ -66,7 +68,13 @@ def decided(config: TrainConfig) -> TrainConfig:
 
     The values are arbitrary.
     """
-    return override(config, _DECIDED)
+    return _with_known(config, _DECIDED)
+
+
+def _with_known(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
+    """Return a config with other values of the fields that it has; a user's agent lacks some."""
+    known = flat(config)
+    return override(config, {name: value for name, value in values.items() if name in known})
 
 
 def merge_resume_config(

@@ -21,10 +21,14 @@ from pathlib import Path
 import numpy as np
 from gymnasium import spaces
 
+from merl.agents import find_agent
+from merl.agents.config import UnloadedConfig
+from merl.agents.networks import own_encoders
 from merl.config import TrainConfig
-from merl.core import CONFIG_FILE, METRICS_FILE, MerlError
+from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, user_code
 from merl.envs.user_env import imports_code, load_module
 from merl.runs import record, trust
+from merl.runs.plain import from_plain
 from merl.runs.provenance import machine
 from merl.runs.record import FORMAT, Bounds
 from merl.runs.resume import REOPENED
@@ -116,6 +120,8 @@ class Run:
     def open(cls, path: Path) -> Run:
         """Open an existing run without importing or executing any code of it.
 
+        The config of a user's own agent is an `UnloadedConfig` until `with_agent`.
+
         Raises:
             MerlError: the folder is not a run, or its config cannot be read.
         """
@@ -142,22 +148,65 @@ class Run:
         """
         if not imports_code(self.config.task):
             return
-        recorded = record.read(self.path)
-        folder: str | None = None
-        try:
-            folder = trust.check(self.path, recorded).folder
-        except MerlError:
-            if trusted:
-                folder = trust.origin(recorded).folder
-            elif named_in is None:
-                raise
+        folders = self._folders_of(self.config.task, trusted, named_in)
         if ":" in self.config.task:
-            folders = [Path(folder) if folder is not None else None, named_in]
-            load_module(self.config.task, *(each for each in folders if each is not None))
+            load_module(self.config.task, *folders)
+
+    def with_agent(self, *, trusted: bool = False, named_in: Path | None = None) -> Run:
+        """Import the module of a user's own agent; return the run with the agent's config.
+
+        Args:
+            trusted: see `load_module`.
+            named_in: a folder that may contain the module as well, because the user named the agent
+                there; this also allows the import.
+
+        Raises:
+            MerlError: the import is not allowed (`trust.check`), it fails, or the class of the
+                agent's config does not accept the recorded values.
+        """
+        agent, name = self.config.agent, self.config.agent_name
+        if not isinstance(agent, UnloadedConfig):
+            return self
+        found = find_agent(name, *self._folders_of(name, trusted, named_in))
+        with record.readable(self.path):
+            loaded = from_plain(type(found.config), agent.values)
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, agent=loaded))
+
+    def load_encoders(self, *, trusted: bool = False, named_in: Path | None = None) -> None:
+        """Import the modules of the user's encoders that the agent's config names.
+
+        Args:
+            trusted: see `load_module`.
+            named_in: as for `load_module`, because the user named the same encoders there.
+
+        Raises:
+            MerlError: the import is not allowed (`trust.check`), or it fails.
+        """
+        for name in own_encoders(self.config.agent):
+            user_code.load_module(name, *self._folders_of(name, trusted, named_in), kind="encoder")
+
+    def _folders_of(self, name: str, trusted: bool, named_in: Path | None) -> list[Path]:
+        """Return the folders from which a module that the run names may be imported.
+
+        Raises:
+            MerlError: the import is not allowed.
+        """
+        recorded = record.read(self.path)
+        folders = [] if named_in is None else [named_in]
+        try:
+            origin = trust.check(self.path, recorded)
+        except MerlError:
+            if not trusted:
+                if named_in is None:
+                    raise
+                return folders
+            origin = trust.origin(recorded)
+        return [Path(origin.folders[name]), *folders] if name in origin.folders else folders
 
     def origin(self) -> Origin | None:
-        """Return the origin of the environment's code; None for merl's and Gymnasium's own."""
-        return trust.origin(record.read(self.path)) if imports_code(self.config.task) else None
+        """Return the origin of the code that the run imports; None if it is merl's own."""
+        origin = trust.origin(record.read(self.path))
+        return origin if origin.code() else None
 
     def record_resumption(self, step: int) -> None:
         """Record that the run resumes at `step`: its current config, versions and machine."""

@@ -14,14 +14,14 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
+from merl.accelerate.networks import speed_up
 from merl.acting.env_checks import check_instances
 from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
 from merl.agents import make_agent
-from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG
-from merl.agents.networks import make_networks
+from merl.agents.config import AgentConfig, ObservationConfig
+from merl.agents.networks import make_networks, own_encoders
 from merl.config import TrainConfig
-from merl.core import MerlError, counted
+from merl.core import Agent, MerlError, counted, user_code
 from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.user_env import load_module
 from merl.evaluation.video import MIN_SIDE
@@ -29,7 +29,7 @@ from merl.replay import ReplaySpec, check_fits
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
 from merl.training.loop import Progress, Randomness
-from merl.training.timing import measure, use_threads
+from merl.training.timing import measure
 
 
 class Setup:
@@ -78,7 +78,7 @@ class Setup:
         self.left_open = left_open(config)
         self.timing = measure(timed, env, eval_env or env, self.space, self.device)
         best = self.timing.best
-        use_threads(best.threads)
+        torch.set_num_threads(best.threads)
         self.config = dataclasses.replace(
             config,
             threads=best.threads,
@@ -86,7 +86,8 @@ class Setup:
             agent=bounded(best.decided(config.agent), config.replay.discount),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
-        self.agent: DDPG = make_agent(
+        self.agent: Agent = make_agent(
+            config.agent_name,
             self.config.agent,
             self.space,
             self.action_space,
@@ -95,6 +96,7 @@ class Setup:
             device=self.device,
             threads=best.threads,
         )
+        speed_up(self.agent)
 
     @classmethod
     @contextmanager
@@ -104,7 +106,7 @@ class Setup:
         Args:
             config: the config of the run.
             new: whether the run is new: its folder must not exist, its replay must fit, and the
-                module of a user's environment may be in the working folder.
+                modules of the user's environment and encoders may be in the working folder.
 
         Raises:
             MerlError: a device, a renderer, an observation or a folder is not available, or a size
@@ -122,6 +124,8 @@ class Setup:
             refuse_existing(run_path(config, home))
             if config.own_env and ":" in config.task:
                 load_module(config.task, home)
+            for name in own_encoders(config.agent):
+                user_code.load_module(name, home, kind="encoder")
         with ExitStack() as stack:
             env = make_run_env(config)
             stack.callback(env.close)
@@ -147,13 +151,15 @@ class Setup:
             yield cls(config, env, eval_env, home, replay_spec)
 
 
-def bounded(agent: AgentConfig, discount: float) -> AgentConfig:
+def bounded(agent: ObservationConfig, discount: float) -> ObservationConfig:
     """Return the config with a value of `critic_high`, if its critic predicts a histogram.
 
     Raises:
         MerlError: the discount gives no bound of the returns, or one that is not above
             `critic_low`.
     """
+    if not isinstance(agent, AgentConfig):
+        return agent
     if agent.critic_loss == "mse" or agent.critic_high is not None:
         return agent
     if discount == 1.0:
@@ -194,11 +200,13 @@ def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.B
     Raises:
         MerlError: the networks or the batch are too large.
     """
-    with torch.device("meta"):
-        networks = make_networks(
-            config.agent, space, action_space.shape[0], config.replay.frame_stack
-        )
-    weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
+    weights = 0
+    if isinstance(config.agent, AgentConfig):
+        with torch.device("meta"):
+            networks = make_networks(
+                config.agent, space, action_space.shape[0], config.replay.frame_stack
+            )
+        weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
     stack, size = config.replay.frame_stack, config.replay.batch_size
     inputs = 2 * 5 * size * sum(math.prod(s.shape or ()) * stack for s in space.values())
     available = available_memory()

@@ -12,6 +12,7 @@ from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.acting.run_env import own_bounds
 from merl.acting.workers import WorkerEnvs
+from merl.agents import load_initial_weights
 from merl.config import TrainConfig
 from merl.core import (
     EnvironmentFailed,
@@ -105,6 +106,8 @@ class Trainer:
             if resumed is not None:
                 bounds = own_bounds(setup.env)
                 resumed[0].check_environment(setup.space, setup.action_space, bounds)
+            if resumed is None or resumed[1] is None:
+                load_initial_weights(setup.agent, setup.home)
             self._resources = stack.pop_all()
         self.config, self._resumed = setup.config, resumed
         self._callbacks = CallbackList(callbacks)
@@ -275,6 +278,7 @@ class Trainer:
             self.replay,
             setup.randomness,
             self.config,
+            setup.device,
             self._callbacks.on_warning,
             setup.progress.updates,
         )

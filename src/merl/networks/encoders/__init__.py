@@ -71,9 +71,11 @@ def make_encoder(name: str, modality: Modality, stack: int, options: EncoderOpti
     if builder is None and isinstance(modality, Frames) and is_timm_model(name):
         return TimmEncoder(name, modality, stack)
     fitting = [known for known, (fits, _) in ENCODERS.items() if isinstance(modality, fits)]
-    others = "a timm model, or module:Class" if isinstance(modality, Frames) else "or module:Class"
-    known = f"use {', '.join(fitting)}, {others}"
+    others = ["a timm model", "module:Class"] if isinstance(modality, Frames) else ["module:Class"]
     if builder is not None:
-        raise MerlError(f"encoder {name!r} is not made for a key of kind {modality.kind}: {known}")
+        raise MerlError(
+            f"encoder {name!r} does not fit a key of kind {modality.kind}: choose from "
+            f"{', '.join([*fitting, *others])}"
+        )
     missing = "" if has_timm() else " (timm is not installed: pip install 'merl-rl[timm]')"
-    raise MerlError(f"encoder {name!r} is unknown: {suggest(name, fitting)}; {known}{missing}")
+    raise MerlError(f"encoder {name!r} is unknown: {suggest(name, [*fitting, *others])}{missing}")

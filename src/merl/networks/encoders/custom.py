@@ -22,9 +22,7 @@ def custom_encoder(name: str, modality: Modality, stack: int) -> nn.Module:
     Raises:
         MerlError: the class cannot be imported, fails, or is no encoder of this modality.
     """
-    module = load_module(
-        name, kind="encoder", form="module:Class, for example my_robot:WristEncoder in my_robot.py"
-    )
+    module = load_module(name, kind="encoder")
     attribute = name.partition(":")[2]
     maker = getattr(module, attribute, None)
     if not (isinstance(maker, type) and issubclass(maker, nn.Module)):

@@ -26,7 +26,7 @@ def bytes_on_device(replay: ReplayBuffer) -> int:
     return sum(array.nbytes for array in replay.arrays.values())
 
 
-class OnDevice:
+class DeviceReplay:
     """Copy, on a device, of a replay.
 
     Args:

@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_replay import Account, Episode, Every, config, make, spec_of, write
 
+from merl.accelerate.device_replay import CHUNK, DeviceReplay, bytes_on_device
 from merl.core import Batch
 from merl.replay import ReplayBuffer
-from merl.replay.on_device import CHUNK, OnDevice, bytes_on_device
 
 EPISODES = st.builds(Episode, st.integers(1, 9), st.sampled_from(["end", "limit", "cut"]))
 
@@ -46,7 +46,7 @@ class EveryOfOne(Every):
         return count * np.eye(len(shares), dtype=int)[self.ring]
 
 
-def check(copy: OnDevice, replay: ReplayBuffer) -> None:
+def check(copy: DeviceReplay, replay: ReplayBuffer) -> None:
     """Compare every step of every ring in the copy with the ring itself."""
     for number, ring in enumerate(replay.rings):
         if not len(ring):
@@ -66,7 +66,7 @@ def test_copy_gives_the_same_samples_as_the_rings(
     stack, n_step = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 4))
     small = config(capacity=20 * len(plans), frame_stack=stack, n_step=n_step)
     replay = ReplayBuffer(spec_of(small, rings=len(plans)))
-    copy = OnDevice(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, torch.device("cpu"))
     writers = [writing(replay, number, plan) for number, plan in enumerate(plans)]
     every = data.draw(st.integers(1, 40))
     timestep = 0
@@ -86,7 +86,7 @@ def test_many_new_slots_are_copied_in_chunks() -> None:
     replay = make(capacity=3 * CHUNK)
     for _ in writing(replay, 0, [Episode(50, "limit")] * 300):
         pass
-    copy = OnDevice(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, torch.device("cpu"))
     copy.follow()
     check(copy, replay)
     assert bytes_on_device(replay) > 3 * CHUNK * 36
@@ -97,7 +97,7 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
     for number, lengths in enumerate(([7, 40], [5])):
         for _ in writing(replay, number, [Episode(length, "limit") for length in lengths]):
             pass
-    copy = OnDevice(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, torch.device("cpu"))
     copy.follow()
     count = 25 * 2000
     batch = copy.sample(count, torch.Generator().manual_seed(0))
@@ -116,7 +116,7 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
 def test_uninitialised_memory_does_not_reach_a_batch() -> None:
     """The copy's memory on a GPU is not initialised, and may hold NaN."""
     replay = make(capacity=50)
-    copy = OnDevice(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, torch.device("cpu"))
     for field in copy._fields.values():
         if field.is_floating_point():
             field.fill_(torch.nan)
@@ -130,7 +130,7 @@ def test_sampling_does_not_wait_for_the_device(monkeypatch: pytest.MonkeyPatch) 
     replay, device, rand = make(capacity=20), torch.device("meta"), torch.rand
     for _ in writing(replay, 0, [Episode(30, "limit")]):
         pass
-    copy = OnDevice(replay, device)
+    copy = DeviceReplay(replay, device)
     copy.follow()
     monkeypatch.setattr(torch, "rand", lambda *a, generator, **k: rand(*a, **k))
     drawn = tensors(copy.sample(5, torch.Generator()))
@@ -149,7 +149,7 @@ def test_rings_after_growth(tmp_path: Path) -> None:
             pass
     replay = ReplayBuffer(replace(spec, capacity=60), tmp_path)
     replay.load_state_dict(shorter.state_dict())
-    copy = OnDevice(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, torch.device("cpu"))
     for episode in range(6):
         copy.follow()
         check(copy, replay)

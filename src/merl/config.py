@@ -18,6 +18,7 @@ from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 
 Setting = Literal["matched", "published"]
+LoggerName = Literal["tensorboard", "wandb", "trackio"]
 
 MOST_STEPS = 10**12
 """Upper limit of `steps` and similar fields, far beyond any real run."""
@@ -113,6 +114,9 @@ class TrainConfig:
     save_every: float = 300.0
     """Seconds between checkpoints; a checkpoint waits for the end of an episode, unless that takes
     much longer."""
+    log: tuple[LoggerName, ...] = ()
+    """Where to write the metrics, in addition to metrics.csv: tensorboard, wandb, trackio (each is
+    an extra of this package)."""
     keep: int = 2
     """Number of recent checkpoints to keep, in addition to the best one."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(

@@ -128,7 +128,7 @@ def test_a_long_episode_gives_a_warning(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The episodes of the task have 20 steps."""
-    monkeypatch.setattr("merl.training.trainer.LONG", limit)
+    monkeypatch.setattr("merl.training.meters.LONG", limit)
     flags = [*SHORT, "--agent", "proprio", "--run-dir", str(tmp_path / "r")]
     assert main(["train", "merl.envs.dot:whole", *flags]) == 0
     assert main(["resume", str(tmp_path / "r"), "--steps", "280"]) == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,8 +10,7 @@ import tyro
 
 from merl.cli.parsing import parse
 from merl.cli.running import go_on, tell_trusted
-from merl.core import MerlError
-from merl.runs.resume import reopened
+from merl.runs.resume import resume_request
 from merl.runs.run import Run
 
 
@@ -32,21 +30,12 @@ class ResumeOptions:
     """Import the environment that the run names, although you have not trained this run here. This
     runs the code of the run's author."""
 
-    def __post_init__(self) -> None:
-        if self.steps is not None and self.steps < 1:
-            raise MerlError(f"steps must be at least 1, not {self.steps}")
-
 
 def resume(args: list[str]) -> int:
     """Resume a run: merl resume RUN [--steps N] [--minutes N]."""
     options = parse(ResumeOptions, "merl resume", args)
     run = Run.open(options.run)
-    asked = dataclasses.replace(
-        reopened(run.config),
-        steps=options.steps or run.config.steps,
-        minutes=options.minutes,
-        device=options.device or run.config.device,
-    )
+    asked = resume_request(run.config, options.steps, options.minutes, options.device)
     if options.trust:
         tell_trusted(run)
     return go_on(run, asked, ["device"], trusted=options.trust)

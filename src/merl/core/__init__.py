@@ -1,6 +1,7 @@
 """Types, errors and small helpers that every package of merl may import."""
 
 from merl.core.errors import (
+    CallbackFailed,
     EnvironmentFailed,
     EnvironmentsLost,
     EvaluationFailed,
@@ -29,6 +30,7 @@ __all__ = [
     "METRICS_FILE",
     "Agent",
     "Batch",
+    "CallbackFailed",
     "EnvironmentFailed",
     "EnvironmentsLost",
     "EvaluationFailed",

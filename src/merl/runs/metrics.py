@@ -1,9 +1,8 @@
-"""Metrics of a run, written during training: `metrics.csv` and TensorBoard events.
+"""The file `metrics.csv` of a run, written during training.
 
-`metrics.csv` is authoritative: one row per environment step at which something was measured, first
-the column `step`, then one column per metric; a cell is empty if the metric was not measured at
-that step. TensorBoard shows the same metrics. A failed write never ends a run: the rows are kept in
-memory and written as soon as that is possible.
+It has one row per environment step at which something was measured, first the column `step`, then
+one column per metric; a cell is empty if the metric was not measured at that step. A failed write
+never ends a run: the rows are kept in memory and written as soon as that is possible.
 """
 
 from __future__ import annotations
@@ -14,22 +13,18 @@ import errno
 import io
 import logging
 import os
-import socket
-import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from merl.core import METRICS_FILE, MerlError
-
-TENSORBOARD_FOLDER = "tensorboard"
 
 _LOG = logging.getLogger(__name__)
 
 
-class MetricsWriter:
-    """Writer of the metrics of a run; a context manager.
+class MetricsFile:
+    """The file `metrics.csv` of a run, open for writing; a context manager.
 
     All rows are also held in memory (a few MB for the longest run). If a new column appears, rows
     are dropped, or a write has failed, the whole file is written to a temporary name and renamed.
@@ -53,15 +48,13 @@ class MetricsWriter:
         self._warn = warn
         self._warned = False
         self._closed = False
-        self._columns, self._rows = _read_rows(self._path)
+        self._columns, self._rows = read_rows(self._path)
         self._written = 0  # number of rows that the file holds
         self._tail = 0  # byte offset of the last row
         self._file: io.FileIO | None = None  # None: outdated, rewrite the whole file
-        self._events: _EventFile | None = None
         # Only here: a folder that is deleted during the run is not created again.
         self._guard(lambda: self._path.parent.mkdir(parents=True, exist_ok=True))
         self._guard(lambda: self._rewrite(None))
-        self._guard(self._open_events)
 
     def __enter__(self) -> Self:
         """Return the writer."""
@@ -99,10 +92,10 @@ class MetricsWriter:
 
         Raises:
             ValueError: the step is before the last row (after a resume, call `trim` first), a
-                name cannot be a column, or the writer is closed.
+                name cannot be a column, or the file is closed.
         """
         if self._closed:
-            raise ValueError(f"the writer of {self._path} is closed")
+            raise ValueError(f"{self._path} is closed")
         if not values:
             return
         last = self.last_step
@@ -125,12 +118,9 @@ class MetricsWriter:
             self._guard(lambda: self._rewrite(file))
         else:
             self._guard(lambda: self._put_last_row(file, begin))
-        self._guard(lambda: self._log_events(step, numbers))
 
     def trim(self, step: int) -> None:
         """Drop every row after `step`: call it when a run resumes from a checkpoint of `step`.
-
-        TensorBoard drops the same events.
 
         Args:
             step: the last step to keep.
@@ -141,7 +131,6 @@ class MetricsWriter:
             self._rows = kept
             self._written = min(self._written, len(kept))
             self._guard(lambda: self._rewrite(file))
-            self._guard(lambda: self._forget_events(step))
 
     def close(self) -> None:
         """Flush all metrics to disk and close the files; may be called twice."""
@@ -153,8 +142,6 @@ class MetricsWriter:
         if self._file is not None:
             self._guard(self._sync)
             self._guard(self._file.close)
-        if self._events is not None:
-            self._guard(self._events.close)
 
     def _guard(self, action: Callable[[], None]) -> None:
         """Run a file operation; if it fails, warn the user once and continue."""
@@ -189,7 +176,7 @@ class MetricsWriter:
     def _put_last_row(self, file: io.FileIO, begin: int) -> None:
         """Write the last row at byte `begin` in one write, and truncate the file after it."""
         try:
-            _write_whole(file, _csv_line(self._cells(self._rows[-1])), begin)
+            write_whole(file, _csv_line(self._cells(self._rows[-1])), begin)
         except BaseException:
             file.close()
             raise
@@ -218,72 +205,8 @@ class MetricsWriter:
     def _cells(self, row: Mapping[str, str]) -> Iterable[str]:
         return (row.get(name, "") for name in self._columns)
 
-    def _open_events(self) -> None:
-        self._events = _EventFile(self._path.parent / TENSORBOARD_FOLDER)
 
-    def _log_events(self, step: int, values: Mapping[str, float]) -> None:
-        if self._events is None:
-            self._open_events()
-        assert self._events is not None
-        self._events.scalars(step, values)
-
-    def _forget_events(self, step: int) -> None:
-        if self._events is None:
-            self._open_events()
-        assert self._events is not None
-        self._events.forget_from(step + 1)
-
-
-class _EventFile:
-    """One TensorBoard event file; each record is written completely and without a buffer.
-
-    TensorBoard's own `EventFileWriter`, which torch's `SummaryWriter` uses, writes from a
-    background thread. On a full disk that thread dies and prints a traceback across the live view.
-    Therefore this class writes TensorBoard's record format directly. It also does not import an
-    installed TensorFlow.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        from tensorboard.compat.proto import event_pb2, summary_pb2  # type: ignore[import-untyped]
-        from tensorboard.summary.writer.record_writer import (  # type: ignore[import-untyped]
-            RecordWriter,
-        )
-
-        self._event_pb2: Any = event_pb2
-        self._summary_pb2: Any = summary_pb2
-        self._record_writer: Any = RecordWriter
-        folder.mkdir(exist_ok=True)
-        # TensorBoard reads the files in the order of their names, so the time comes first.
-        stamp = f"{time.time_ns() / 1e9:020.9f}.{socket.gethostname()}.{os.getpid()}"
-        self._file = io.FileIO(folder / f"events.out.tfevents.{stamp}", "w")
-        try:
-            self._append(file_version="brain.Event:2")
-        except OSError:
-            self._file.close()
-            raise
-
-    def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Write the values of one step."""
-        Summary = self._summary_pb2.Summary  # noqa: N806 - a class
-        tagged = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
-        self._append(step=step, summary=Summary(value=tagged))
-
-    def forget_from(self, step: int) -> None:
-        """Make TensorBoard drop the events of earlier files at `step` and later."""
-        log = self._event_pb2.SessionLog
-        self._append(step=step, session_log=log(status=log.START))
-
-    def close(self) -> None:
-        self._file.close()
-
-    def _append(self, **fields: Any) -> None:
-        event = self._event_pb2.Event(wall_time=time.time(), **fields)
-        record = io.BytesIO()
-        self._record_writer(record).write(event.SerializeToString())
-        _write_whole(self._file, record.getvalue(), self._file.seek(0, io.SEEK_END))
-
-
-def _read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+def read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """Return columns and rows (name -> cell text) of a metrics file.
 
     An incomplete last line is left out.
@@ -319,7 +242,7 @@ def _csv_line(cells: Iterable[str]) -> bytes:
     return line.getvalue().encode()
 
 
-def _write_whole(file: io.FileIO, data: bytes, begin: int) -> None:
+def write_whole(file: io.FileIO, data: bytes, begin: int) -> None:
     """Write `data` at byte `begin` and truncate after it; on failure truncate at `begin`."""
     file.seek(begin)
     try:

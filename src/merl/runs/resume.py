@@ -16,6 +16,7 @@ HARMLESS = (
     "worker_restarts",
     "worker_timeout",
     "save_every",
+    "log",
     "keep",
     "device",
     "threads",
@@ -73,6 +74,22 @@ def decided(config: TrainConfig) -> TrainConfig:
     for name, value in values.items():
         config = _replaced(config, name, value)
     return config
+
+
+def resume_request(
+    recorded: TrainConfig, steps: int | None, minutes: float | None, device: Any = None
+) -> TrainConfig:
+    """Return the config that asks to resume a run with other values; None keeps the recorded one.
+
+    Raises:
+        MerlError: a value is out of its range.
+    """
+    return dataclasses.replace(
+        reopened(recorded),
+        steps=recorded.steps if steps is None else steps,
+        minutes=minutes,
+        device=device or recorded.device,
+    )
 
 
 def merge_resume_config(

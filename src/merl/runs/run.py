@@ -2,7 +2,8 @@
 
 config.json     config, spaces, versions, commit, machine
 metrics.csv     the metrics, one row per episode and evaluation (authoritative)
-tensorboard/    the same metrics as TensorBoard events
+tensorboard/    the same metrics as TensorBoard events, with `--log tensorboard`
+wandb/          the files of Weights & Biases, with `--log wandb`
 checkpoints/    the checkpoints from which the run resumes
 replay/         the memory-mapped replay buffer
 videos/         one episode of each filmed evaluation
@@ -16,6 +17,7 @@ import json
 import os
 import shlex
 import shutil
+import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -291,6 +293,11 @@ class Run:
             part.replace(self.path / CONFIG_FILE)
         except OSError as error:
             raise MerlError(f"{self.path} is not writable: {error.strerror}") from None
+
+    @property
+    def public_id(self) -> str:
+        """Return an id of the run that may be published; `trust` keeps the recorded one secret."""
+        return uuid.uuid5(uuid.UUID(_read(self.path)["id"]), "merl").hex
 
     @property
     def checkpoints(self) -> Path:

@@ -16,6 +16,7 @@ from gymnasium import spaces
 
 from merl.acting.env_checks import check_instances
 from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces
+from merl.acting.workers import check_sendable
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
@@ -23,9 +24,10 @@ from merl.agents.networks import make_networks
 from merl.config import TrainConfig
 from merl.core import MerlError, counted
 from merl.core.resources import available_memory, keep_freed_memory
-from merl.envs.user_env import load_module
+from merl.envs.user_env import MakeEnv, load_module
 from merl.evaluation.video import MIN_SIDE
-from merl.replay import check_fits
+from merl.networks.settings import torch_settings
+from merl.replay import ReplayBuffer, check_fits
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
 from merl.training.loop import Progress, Randomness
@@ -39,6 +41,7 @@ class Setup:
         config: the run's config, with fixed values of `device`, `threads`, and the agent's
             `precision`, `torch_compile` and `critic_high`.
         left_open: names of the fields that the given config left open.
+        make: makes the environment, if the config does not name it; else None.
         timing: time of a step and of an update on this machine.
         env: the environment for training.
         eval_env: the environment for evaluation; None without evaluations (`eval.every` is 0).
@@ -58,8 +61,9 @@ class Setup:
         env: gymnasium.Env[Any, Any],
         eval_env: gymnasium.Env[Any, Any] | None,
         home: Path,
+        make: MakeEnv | None,
     ) -> None:
-        self.env, self.eval_env, self.home = env, eval_env, home
+        self.env, self.eval_env, self.home, self.make = env, eval_env, home, make
         self.records_video = eval_env is not None and eval_env.render_mode == "rgb_array"
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
@@ -91,15 +95,31 @@ class Setup:
             threads=best.threads,
         )
 
+    def open_replay(self, directory: Path) -> ReplayBuffer:
+        """Open the replay buffer of the run in a folder, which is empty if the run is new."""
+        config = self.config
+        with torch_settings(self.device):
+            return ReplayBuffer(
+                config.replay,
+                self.space,
+                self.action_space,
+                count=config.num_envs,
+                directory=directory,
+                capacity=config.capacity,
+            )
+
     @classmethod
     @contextmanager
-    def prepare(cls, config: TrainConfig, *, new: bool) -> Iterator[Setup]:
+    def prepare(
+        cls, config: TrainConfig, *, new: bool, make: MakeEnv | None = None
+    ) -> Iterator[Setup]:
         """Make environments and agent of a run, and check its config; write no files.
 
         Args:
             config: the config of the run.
             new: whether the run is new: its folder must not exist, its replay must fit, and the
                 module of a user's environment may be in the working folder.
+            make: makes the environment, if the config does not name it.
 
         Raises:
             MerlError: a device, a renderer, an observation or a folder is not available, or a size
@@ -115,10 +135,12 @@ class Setup:
         home = Path.cwd()  # before user code runs, which may change the working folder
         if new:
             refuse_existing(run_path(config, home))
-            if config.own_env and ":" in config.task:
+            if config.own_env and ":" in config.task and make is None:
                 load_module(config.task, home)
+        if config.has_workers:
+            check_sendable(config, make)
         with ExitStack() as stack:
-            env = make_run_env(config)
+            env = make_run_env(config, make)
             stack.callback(env.close)
             space, actions = run_spaces(config, env)
             if new:
@@ -135,13 +157,13 @@ class Setup:
                 size = max(config.env.render_size, MIN_SIDE)
                 # Without videos, avoid the reset that tests whether a user's environment renders.
                 mode = None if config.own_env and config.eval.video == "none" else "rgb_array"
-                eval_env = make_run_env(config.evaluated, render_mode=mode, render_size=size)
+                eval_env = make_run_env(config.evaluated, make, render_mode=mode, render_size=size)
                 stack.callback(eval_env.close)
                 expected = EnvSpaces.of(config, env)
                 expected.check(EnvSpaces.of(config, eval_env), "the one for evaluations")
                 if config.own_env:
                     check_instances(env, eval_env)
-            yield cls(config, env, eval_env, home)
+            yield cls(config, env, eval_env, home, make)
 
 
 def bounded(agent: AgentConfig, discount: float) -> AgentConfig:

@@ -80,9 +80,6 @@ class TrainConfig:
     """Seed of all randomness in the run."""
     steps: int = 1_000_000
     """Number of environment steps."""
-    measure: bool = False
-    """Time your own environment with 75 random steps before the run starts, as merl always does for
-    its own tasks; if not set, the first steps of the run are timed."""
     minutes: float | None = None
     """Time limit of the run in minutes, since start or resume."""
     run_dir: Path | None = None

@@ -20,7 +20,7 @@ from merl.config import LoggerName
 from merl.core import MerlError
 from merl.envs.wrappers import in_one_line
 from merl.evaluation.evaluation import Evaluation
-from merl.runs.metrics import MetricsFile, write_whole
+from merl.runs.metrics import MetricsFile, append_whole
 from merl.runs.plain import to_plain
 
 if TYPE_CHECKING:
@@ -63,9 +63,7 @@ class Logger(Callback):
 
     def on_evaluation(self, step: int, evaluation: Evaluation) -> None:
         """See `Callback`."""
-        values = {f"eval/{name}": value for name, value in evaluation.metrics().items()}
-        values["time/seconds"] = self._trainer.clock.seconds()
-        self._guarded(lambda: self.log(step, values))
+        self._guarded(lambda: self.log(step, self._trainer.evaluations.row))
 
     def on_end(self, outcome: Outcome | None) -> None:
         """See `Callback`."""
@@ -158,14 +156,14 @@ class TensorBoard(Logger):
         event = self._proto.Event(wall_time=time.time(), **fields)
         record = io.BytesIO()
         self._writer.RecordWriter(record).write(event.SerializeToString())
-        write_whole(self._file, record.getvalue(), self._file.seek(0, io.SEEK_END))
+        append_whole(self._file, record.getvalue())
 
 
 class WandB(Logger):
     """A run of Weights & Biases; a resumed run continues it.
 
-    With the environment variable `WANDB_MODE=offline` it is written to the run's folder, for
-    `wandb sync`.
+    W&B writes to `wandb/` in the working folder or in `WANDB_DIR`, and with `WANDB_MODE=offline`
+    only there, for `wandb sync`. (It makes links, with which a run's folder could not be trusted.)
 
     Args:
         project: the project that the run belongs to.
@@ -202,8 +200,7 @@ class WandB(Logger):
     def _named(self, run: Run) -> dict[str, Any]:
         """Return the arguments by which the library finds the run again."""
         settings = self._library.Settings(console="off", silent=True, reinit="create_new")
-        name, identity = run.path.name, run.public_id
-        return {"name": name, "id": identity, "dir": run.path, "settings": settings}
+        return {"name": run.path.name, "id": run.public_id, "settings": settings}
 
 
 class Trackio(WandB):

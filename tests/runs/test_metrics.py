@@ -162,7 +162,7 @@ def test_an_interrupt_between_memory_and_file_loses_no_row(tmp_path, monkeypatch
     with MetricsFile(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
         with monkeypatch.context() as patch:
-            patch.setattr(metrics, "write_whole", interrupt)
+            patch.setattr(metrics, "append_whole", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 writer.write(2, {"a": 2.0})
         writer.write(2, {"a": 3.0})

@@ -169,13 +169,10 @@ def test_only_training_and_evaluation_move_a_users_robot(
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     assert moves(tmp_path, "--eval.video", "none") == (10 + 2 + 3, 100 + 20)  # 3: comparing resets
     printed = " ".join(capsys.readouterr().out.split())
-    assert "100 steps of test_own_env:Logged on cpu (their duration is printed after" in printed
-    assert "49 steps of test_own_env:Logged on cpu take about 0:00:0" in printed
+    assert "100 steps of test_own_env:Logged on cpu" in printed
     assert "nothing to compare with (--eval.references takes 20 episodes" in printed
     assert moves(tmp_path) == (10 + 2 + 3 + 1, 100 + 20)  # 1: does it render?
     assert moves(tmp_path, "--eval.video", "none", "--eval.references") == (15 + 40, 120 + 400)
-    resets, steps = moves(tmp_path, "--eval.video", "none", "--measure")
-    assert (resets > 15, steps) == (True, 120 + 75)
 
 
 @pytest.mark.parametrize("agent", ["ddpg", "sac", "merl_state"])

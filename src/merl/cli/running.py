@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.filesize import decimal
 
 from merl.acting.run_env import key_lines
-from merl.cli.duration import DurationView, duration
+from merl.cli.duration import duration
 from merl.cli.output import make_console
 from merl.cli.summary import summarize
 from merl.config import TrainConfig
@@ -21,6 +21,7 @@ from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
+from merl.training.live_view import LiveView
 from merl.training.outcome import Outcome
 from merl.training.resuming import resumption
 from merl.training.setup import Setup
@@ -96,7 +97,7 @@ def _fit(
 ) -> Outcome:
     """Train with the live view; the trainer and the files that it maps are gone at the end."""
     with ExitStack() as stack:
-        view = DurationView(console, _scale(config))
+        view = LiveView(console, _scale(config))
         with console.status("building the scene and timing this machine", spinner="line"):
             trainer = stack.enter_context(Trainer(config, [view], resumed=resumed))
         done = resumed[1].step if resumed and resumed[1] else 0

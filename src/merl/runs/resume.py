@@ -11,7 +11,6 @@ from merl.core import MerlError
 
 HARMLESS = (
     "steps",
-    "measure",
     "minutes",
     "worker_restarts",
     "worker_timeout",

@@ -3,7 +3,6 @@
 config.json     config, spaces, versions, commit, machine
 metrics.csv     the metrics, one row per episode and evaluation (authoritative)
 tensorboard/    the same metrics as TensorBoard events, with `--log tensorboard`
-wandb/          the files of Weights & Biases, with `--log wandb`
 checkpoints/    the checkpoints from which the run resumes
 replay/         the memory-mapped replay buffer
 videos/         one episode of each filmed evaluation
@@ -328,13 +327,14 @@ def _read_config(plain: Mapping[str, Any]) -> TrainConfig:
 
 
 def _updated(plain: Mapping[str, Any], space: spaces.Dict) -> Mapping[str, Any]:
-    """Replace fields and values of a recorded config that merl no longer has.
+    """Replace or drop fields and values of a recorded config that merl no longer has.
 
     A removed renderer is replaced only if the agent uses no image of merl's own tasks.
 
     Raises:
         MerlError: the run depends on a value that no longer exists.
     """
+    plain = {name: value for name, value in plain.items() if name != "measure"}
     env = plain.get("env")
     if not isinstance(env, dict):
         return plain

@@ -20,7 +20,7 @@ LOCK_FILE = "lock"
 PART = f".{CONFIG_FILE}.part"
 """Temporary name of `config.json` while it is written."""
 _FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, PART, LOCK_FILE)
-_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos", "wandb")
+_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 
 
 def run_path(config: TrainConfig, home: Path | None = None) -> Path:

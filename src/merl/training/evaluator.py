@@ -12,6 +12,7 @@ from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.policy import Policy
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
+from merl.training.meters import Clock
 from merl.training.setup import Setup
 
 ATTEMPTS = 3
@@ -29,23 +30,27 @@ class Evaluations:
     Args:
         setup: agent, environment and progress.
         run: the run's folder.
+        clock: provides the training time of the run.
         callbacks: notified of evaluations and warnings.
         interrupt: signals; the first one ends an evaluation immediately.
 
     Attributes:
         last: the last evaluation; None before the first.
+        row: the metrics of the last evaluation, by their names in `metrics.csv`.
     """
 
     def __init__(
         self,
         setup: Setup,
         run: Run,
+        clock: Clock,
         callbacks: Callback,
         interrupt: Interrupt,
     ) -> None:
         self._setup, self._config, self._run = setup, setup.config, run
-        self._callbacks, self._interrupt = callbacks, interrupt
+        self._clock, self._callbacks, self._interrupt = clock, callbacks, interrupt
         self.last: Evaluation | None = None
+        self.row: dict[str, float] = {}
         self._warned = set[str]()
 
     def are_due(self) -> bool:
@@ -84,6 +89,8 @@ class Evaluations:
         self._run.check_there()
         progress.evaluated, progress.attempts = progress.step, 0
         progress.reports_success |= self.last.success_end is not None
+        self.row = {f"eval/{name}": value for name, value in self.last.metrics().items()}
+        self.row["time/seconds"] = self._clock.seconds()
         self._callbacks.on_evaluation(progress.step, self.last)
         if previous is not None and not self.last.starts_as(previous):
             self._warn_once(

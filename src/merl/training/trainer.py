@@ -33,6 +33,7 @@ from merl.training.updating import make_update
 
 _TRAINING = Lock()
 """Held while a run is trained: signals, random generators and torch's threads are the process's."""
+_BUSY = "this process is training another run: wait for its end, or train in another process"
 
 
 class Trainer:
@@ -56,6 +57,7 @@ class Trainer:
         run: the run's folder; set by `fit`.
         replay: the replay buffer; set by `fit`.
         clock: training time; set by `fit`.
+        evaluations: the evaluations so far; set by `fit`.
 
     Raises:
         MerlError: the config cannot work on this machine, the environment differs from that of the
@@ -65,6 +67,7 @@ class Trainer:
     run: Run
     replay: ReplayBuffer
     clock: Clock
+    evaluations: Evaluations
 
     def __init__(
         self,
@@ -75,7 +78,7 @@ class Trainer:
         make: MakeEnv | None = None,
     ) -> None:
         if _TRAINING.locked():
-            raise _another_run()
+            raise MerlError(_BUSY)
         self._csv = CSV()
         self._callbacks = CallbackList([self._csv, *make_loggers(config.log), *callbacks])
         with ExitStack() as stack:
@@ -127,17 +130,17 @@ class Trainer:
                 checkpoint only.
         """
         if not _TRAINING.acquire(blocking=False):
-            raise _another_run()
+            raise MerlError(_BUSY)
         with ExitStack() as stack:
             stack.callback(_TRAINING.release)
             if self._resumed is not None:
                 run, start = self._resumed
-                run = dataclasses.replace(run, config=self.config)
-                return self._fit(run, start)
+                return self._fit(dataclasses.replace(run, config=self.config), start)
             setup = self.setup
             spaces = setup.space, setup.action_space, own_bounds(setup.env)
-            new = Run.begin(self.config, *spaces, setup.left_open, home=setup.home)
-            run = stack.enter_context(new)
+            run = stack.enter_context(
+                Run.begin(self.config, *spaces, setup.left_open, home=setup.home)
+            )
             try:
                 return self._fit(run, None)
             except BaseException:
@@ -147,21 +150,20 @@ class Trainer:
 
     def _fit(self, run: Run, start: Checkpoint | None) -> Outcome:
         """Open replay and environments, restore the run if it resumes, and train."""
-        self.run, setup = run, self.setup
-        self.clock = Clock()
+        self.run, self.clock, setup = run, Clock(), self.setup
         with ExitStack() as stack:
             self._interrupt = stack.enter_context(Interrupt().listening())
             self.replay = setup.open_replay(run.replay)
             with self._interrupt.raising():
                 self._environments = self._make_environments()
             stack.callback(self._environments.close)
-            self._evaluations = Evaluations(setup, run, self._callbacks, self._interrupt)
+            self.evaluations = Evaluations(setup, run, self.clock, self._callbacks, self._interrupt)
             self._saver = Saver(
                 setup,
                 run,
                 self.replay,
                 self._environments,
-                self._evaluations,
+                self.evaluations,
                 self.clock,
                 self._guard,
                 self._callbacks,
@@ -215,8 +217,7 @@ class Trainer:
 
     def _train(self) -> Outcome:
         """Run the loop of Algorithm 1; log, evaluate and save between its steps."""
-        progress = self.progress
-        steps = self._steps()
+        progress, steps = self.progress, self._steps()
         evaluates = self.setup.eval_env is not None
         if evaluates and not self.setup.records_video and self.config.eval.video != "none":
             self.warn("there will be no videos: the environment does not render to an array")
@@ -225,7 +226,7 @@ class Trainer:
                 f"no checkpoint can be written to {self.run.path}: free space on its disk, or "
                 "choose a folder on another disk with --run-dir"
             )
-        if progress.step and self._evaluations.are_due() and not self.replay.state_dict()["open"]:
+        if progress.step and self.evaluations.are_due() and not self.replay.state_dict()["open"]:
             self._evaluate()  # the run was stopped before this evaluation or within it
             self._saver.save()
         self.clock.mark(progress)
@@ -292,8 +293,8 @@ class Trainer:
             self.stop()
 
     def _outcome(self, saved: bool) -> Outcome:
-        number = self._interrupt.number
-        return Outcome(self.run, self.progress, self._evaluations.last, number, saved)
+        last, number = self.evaluations.last, self._interrupt.number
+        return Outcome(self.run, self.progress, last, number, saved)
 
     def _count_worker_loss(self, cause: str) -> None:
         """Count the death of a worker process; the loop restarts the environments.
@@ -322,10 +323,9 @@ class Trainer:
         return spent or self._stops or self._interrupt.number is not None
 
     def _at_episode_end(self) -> None:
-        if self._evaluations.are_due():
+        if is_due := self.evaluations.are_due():
             self._evaluate()
-            self._saver.save()
-        elif self._saver.interval.is_due():
+        if is_due or self._saver.interval.is_due():
             self._saver.save()
 
     def _row(self, result: StepResult) -> dict[str, float]:
@@ -338,17 +338,11 @@ class Trainer:
         values = {f"train/{k}": v for k, v in means.items()}
         values |= self._averages.take()
         values |= self.clock.rates(progress)
-        values["replay/steps"] = float(len(self.replay))
+        values |= {"replay/steps": float(len(self.replay))}
         if self.config.has_workers:
             values["workers/restarts"] = float(progress.restarts)
         return values
 
     def _evaluate(self, last: bool = False) -> None:
-        self._evaluations.run(self._saver.save, last=last)
+        self.evaluations.run(self._saver.save, last=last)
         self.clock.mark(self.progress)  # the rates do not include the evaluation
-
-
-def _another_run() -> MerlError:
-    return MerlError(
-        "this process is training another run: wait for its end, or train in another process"
-    )

@@ -85,30 +85,34 @@ class Logger(Callback):
             )
 
 
-class CSV(Logger):
-    """The authoritative log of every run, `metrics.csv`; rows after a resumed step are dropped."""
+class CSV(Callback):
+    """The authoritative log of every run, `metrics.csv`; rows after a resumed step are dropped.
 
-    _file: MetricsFile | None = None
+    Attributes:
+        file: the file; None before the start.
+    """
 
-    @property
-    def unwritten(self) -> int:
-        """Return the number of rows that could not be written."""
-        return 0 if self._file is None else self._file.unwritten
+    file: MetricsFile | None = None
 
-    def open(self, trainer: Trainer) -> None:
-        """See `Logger`."""
-        self._file = MetricsFile(trainer.run.path, trainer.warn)
-        self._file.trim(trainer.progress.step)
+    def on_start(self, trainer: Trainer) -> None:
+        """See `Callback`."""
+        self._trainer = trainer
+        self.file = MetricsFile(trainer.run.path, trainer.warn)
+        self.file.trim(trainer.progress.step)
 
-    def log(self, step: int, values: Mapping[str, float]) -> None:
-        """See `Logger`."""
-        if self._file is not None:
-            self._file.write(step, values)
+    def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
+        """See `Callback`."""
+        if self.file is not None:
+            self.file.write(step, metrics)
 
-    def close(self, outcome: Outcome | None) -> None:
-        """See `Logger`."""
-        if self._file is not None:
-            self._file.close()
+    def on_evaluation(self, step: int, evaluation: Evaluation) -> None:
+        """See `Callback`."""
+        self.on_episode(step, self._trainer.evaluations.row)
+
+    def on_end(self, outcome: Outcome | None) -> None:
+        """See `Callback`."""
+        if self.file is not None:
+            self.file.close()
 
 
 class TensorBoard(Logger):

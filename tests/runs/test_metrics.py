@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import merl
 from merl.core import MerlError
 from merl.report.curves import read_metrics
 from merl.runs import metrics
@@ -249,3 +250,14 @@ def test_unwritten_counts_the_rows_that_are_not_in_the_file(tmp_path, disk):
         disk.full = True
         writer.write(5, {"b": 1.0})
     assert writer.unwritten == 1
+
+
+def test_resume_refuses_an_unreadable_file(tmp_path):
+    run = tmp_path / "run"
+    small = {"preset": "smoke", "steps": 20, "threads": 1, "eval.every": 0}
+    merl.train("merl.envs.dot:whole", run_dir=run, progress=False, **small)
+    (run / "metrics.csv").write_text("step,a\n1\n")
+    with pytest.raises(MerlError, match="is not a metrics file that can be continued"):
+        merl.resume(run, steps=40, progress=False)
+    assert (run / "metrics.csv").read_text() == "step,a\n1\n"
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["00000020"]

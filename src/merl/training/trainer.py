@@ -178,7 +178,8 @@ class Trainer:
                 outcome = self._train_and_rescue()
             finally:
                 self._callbacks.on_end(outcome)
-        return dataclasses.replace(outcome, unwritten=self._csv.unwritten)
+        unwritten = self._csv.file.unwritten if self._csv.file else 0
+        return dataclasses.replace(outcome, unwritten=unwritten)
 
     def _make_environments(self) -> Environments:
         env = self.setup.env

@@ -254,7 +254,7 @@ def test_unwritten_counts_the_rows_that_are_not_in_the_file(tmp_path, disk):
 
 def test_resume_refuses_an_unreadable_file(tmp_path):
     run = tmp_path / "run"
-    small = {"preset": "smoke", "steps": 20, "threads": 1, "eval.every": 0}
+    small = {"preset": "smoke", "steps": 20, "threads": 1, "eval.every": 0, "replay.batch_size": 4}
     merl.train("merl.envs.dot:whole", run_dir=run, progress=False, **small)
     (run / "metrics.csv").write_text("step,a\n1\n")
     with pytest.raises(MerlError, match="is not a metrics file that can be continued"):

@@ -1,6 +1,7 @@
 # make train: set up and train MERL on reach_duplo for about ten minutes.
 # make test: set up and pass the tests in their short form; make test-all runs the long forms too.
-# Both need nothing but Python 3.11 or 3.12, make, bash and a package index.
+# make docs: set up and build the documentation site, docs/_build/index.html.
+# All need nothing but Python 3.11 or 3.12, make, bash and a package index.
 
 PYTHON := $(shell for p in python3.12 python3.11; do "$$p" --version >/dev/null 2>&1 && echo $$p && break; done)
 VENV := .venv
@@ -8,7 +9,7 @@ BIN := $(VENV)/bin
 MINUTES := 10
 PYTEST_FLAGS := --numprocesses 2 --dist worksteal --durations 10
 
-.PHONY: help setup train test test-all clean
+.PHONY: help setup train test test-all docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -26,18 +27,22 @@ train: setup
 	@$(BIN)/merl train reach_duplo --preset laptop --minutes $(MINUTES)
 
 test: setup
-	@$(BIN)/ruff check src tests benchmarks
-	@$(BIN)/ruff format --check src tests benchmarks
+	@$(BIN)/ruff check src tests benchmarks examples docs
+	@$(BIN)/ruff format --check src tests benchmarks examples docs
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 	@$(BIN)/pytest -m "not long" $(PYTEST_FLAGS)
 
 test-all: setup
-	@$(BIN)/ruff check src tests benchmarks
-	@$(BIN)/ruff format --check src tests benchmarks
+	@$(BIN)/ruff check src tests benchmarks examples docs
+	@$(BIN)/ruff format --check src tests benchmarks examples docs
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 	@$(BIN)/pytest $(PYTEST_FLAGS)
+
+docs: setup
+	@$(BIN)/sphinx-build -E -W --keep-going -q -b html docs docs/_build
+	@echo "docs/_build/index.html"
 
 clean:
 	rm -rf $(VENV)

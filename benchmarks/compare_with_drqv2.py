@@ -5,7 +5,7 @@
 
 For losses and weights, both updates start with the same weights and get the same batches, crops and
 noise, in float64. For the speed, the authors' update in full size and single precision takes turns
-with the plain DrQ-v2 of `merl bench update`.
+with merl's, in single precision and in bf16.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 import types
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -30,7 +31,7 @@ from reference import Chance
 from merl.agents.ddpg import DDPG
 from merl.agents.drqv2 import DrQV2Config
 from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
-from merl.bench.update import ACTIONS, as_sample, noise_batch, reference_of
+from merl.bench.update import ACTIONS, learner_of, noise_batch
 from merl.core import Batch
 
 ACTION = 200_000  # index of an action; the noise falls over 500,000 actions
@@ -48,19 +49,24 @@ def main(path: tyro.conf.Positional[Path], repeats: int = 0) -> None:
 
 
 def time(path: Path, repeats: int) -> None:
-    """Time the authors' update in turns with the reference's; print the speeds."""
+    """Time the authors' update in turns with merl's; print the speeds."""
     theirs, _ = authors_agent(path, hidden_dim=1024, actions=ACTIONS)
-    sample, plain = as_sample(noise_batch(256), vector=False), reference_of("drqv2")
-    given = (sample.image, sample.action, sample.reward, sample.discount, sample.next_image)
+    batch, cpu = noise_batch(256), torch.device("cpu")
+    image, next_image = (
+        frames(seen["image"]).contiguous() for seen in (batch.observation, batch.next_observation)
+    )
+    given = image, batch.action, batch.reward[:, None], batch.discount[:, None], next_image
     sides: dict[str, Work] = {
         "its authors'": lambda: theirs.update(iter([given]), ACTION),
-        "the reference": lambda: plain.update(sample),
+        "merl, fp32": partial(learner_of("drqv2", "fp32", cpu).update, batch),
+        "merl, bf16": partial(learner_of("drqv2", "bf16", cpu).update, batch),
     }
-    turns = take_turns(sides, repeats, others=sides)
+    turns = take_turns(sides, repeats, others=["its authors'"])
     for side, seconds in turns.items():
-        print(f"{side}: {shown(spread([1 / one for one in seconds]))} updates/s")
-    ratio = [a / b for a, b in zip(*turns.values(), strict=True)]
-    print(f"the reference is {shown(spread(ratio))} times as fast, {circumstances()['machine']}")
+        ratio = [a / b for a, b in zip(turns["its authors'"], seconds, strict=True)]
+        speed = shown(spread([1 / one for one in seconds]))
+        print(f"{side}: {speed} updates/s, {shown(spread(ratio))} times the authors'")
+    print(circumstances()["machine"])
 
 
 def compare(path: Path) -> None:
@@ -75,7 +81,8 @@ def compare(path: Path) -> None:
             other.copy_(theirs_from(mine))
     for update in range(4):
         batch, chance = CASE.batch_of(update, torch.float64), CASE.chance_of(update)
-        found = ours.learn(batch, draws_of(chance, CONFIG, torch.float64, CASE.step))
+        noise = draws_of(chance, CONFIG, torch.float64, CASE.step)
+        found = ours.update(batch, noise, step=CASE.step)
         losses = authors_update(theirs, utils, batch, chance)
         for name in ("critic_loss", "actor_loss"):
             print(f"update {update + 1}, {name}: {float(found[name]):.9f} and {losses[name]:.9f}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from merl.core.statistics import bootstrap_interval, wilson_interval
 from merl.experiments.small_tasks import SPLIT, optimum, returns_of
-from merl.report.curves import Curve, curve
+from merl.report.curves import Curve, curve_of, read_metrics
 from merl.report.figures import learning_curves
 from merl.report.references import references
 
@@ -51,7 +51,7 @@ def laptop() -> None:
     lines = {row.name: row.returns.mean for row in references("reach_duplo")}
     lines.pop("no motion")
     learning_curves(
-        {"MERL, preset laptop": sorted((ROOT / "docs/speedrun/data").glob("laptop-10-s?.csv"))},
+        {"MERL, preset laptop": sorted((DATA / "speedrun").glob("laptop-10-s?.csv"))},
         IMAGES / "laptop.png",
         x="minutes",
         references=lines,
@@ -78,7 +78,7 @@ def seeds(task: str, agent: str, preset: str) -> list[Curve]:
     files = sorted(AGENTS.glob(f"{task}-{agent}-{preset}-matched-s*.csv"))
     if (agent, preset) == ("merl", "laptop"):
         files = sorted(DATA.glob("laptop-seed?.csv"))  # these runs are merl's on reach_duplo
-    whole = [curve(file, "eval/return") for file in files]
+    whole = [curve_of(read_metrics(file), "eval/return") for file in files]
     return [Curve(*(part[one.steps <= MOST[preset]] for part in one)) for one in whole]
 
 

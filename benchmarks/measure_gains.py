@@ -25,7 +25,9 @@ from merl.agents.ddpg import DDPG
 from merl.bench.measuring import circumstances
 from merl.bench.update import learner_of, noise_batch
 from merl.core.resources import keep_freed_memory
-from merl.networks import augmentation, encoders, representation
+from merl.modalities import Image
+from merl.networks import augmentation, representation
+from merl.networks.encoders.frames import ConvEncoder
 
 Change = Callable[[DDPG], AbstractContextManager[Any]]
 
@@ -41,9 +43,7 @@ def main(precision: Literal["bf16", "fp32"] = "bf16", repeats: int = 5) -> None:
         "the shift by one gather": lambda _: patch.object(
             representation, "shift", augmentation._shift_by_index
         ),
-        "pixels scaled one by one": lambda _: patch.object(
-            encoders.ConvEncoder, "forward", scale_pixels
-        ),
+        "pixels scaled one by one": lambda _: patch.object(ConvEncoder, "forward", scale_pixels),
         "channels first": channels_first,
         "gradients of all weights": lambda _: gradients_of_all(),
         "Adam weight by weight": weight_by_weight,
@@ -56,9 +56,9 @@ def main(precision: Literal["bf16", "fp32"] = "bf16", repeats: int = 5) -> None:
         for _ in range(repeats):
             for name, change in changes.items():
                 with change(agents[name]):
-                    agents[name].update(batch)
+                    agents[name].update(batch, step=0)
                     start = time.process_time()
-                    agents[name].update(batch)
+                    agents[name].update(batch, step=0)
                     taken[name].append(time.process_time() - start)
     whole = median(taken["as it is"])
     for name, seconds in taken.items():
@@ -79,20 +79,18 @@ def given_back() -> Iterator[None]:
 def channels_first(agent: DDPG) -> Iterator[None]:
     """Keep weights and images in torch's default memory order."""
     agent.networks.encoders.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    as_input = augmentation.to_input
+    as_input = Image.centred
 
-    def contiguous(images: Tensor, dtype: torch.dtype, middle: int) -> Tensor:
-        return as_input(images, dtype, middle).contiguous()
+    def contiguous(image: Image, stacks: Tensor, dtype: torch.dtype) -> Tensor:
+        return as_input(image, stacks, dtype).contiguous()
 
-    with patch.object(encoders, "to_input", contiguous):
+    with patch.object(Image, "centred", contiguous):
         yield
 
 
-def scale_pixels(encoder: encoders.ConvEncoder, stacks: Tensor) -> Tensor:
+def scale_pixels(encoder: ConvEncoder, stacks: Tensor) -> Tensor:
     """Encode images with their pixels scaled (x / 255 - 0.5) in fp32 before the first layer."""
-    whole = augmentation.to_input(stacks, torch.float32)
-    scaled = whole.add_(128).mul_(1 / 255).sub_(0.5)
-    maps: Tensor = encoder.convolutions(scaled)
+    maps: Tensor = encoder.convolutions(encoder.frames.to_input(stacks))
     return maps.permute(0, 2, 3, 1).flatten(1)
 
 

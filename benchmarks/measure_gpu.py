@@ -22,8 +22,9 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Literal
@@ -37,14 +38,15 @@ from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from merl.accelerate.device_replay import DeviceReplay
+from merl.accelerate.recording import Recorded, UpdateOnDevice
+from merl.accelerate.twins import join_heads
 from merl.agents.ddpg import DDPG
 from merl.bench import train, update
 from merl.bench.measuring import circumstances, spread
 from merl.core import MerlError
 from merl.networks.critic import TwinCritic
-from merl.replay.on_device import OnDevice
 from merl.training.setup import choose_device
-from merl.training.updating import Recorded, UpdateOnDevice
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,8 +129,8 @@ def agrees(agent: str, batch_size: int) -> dict[str, float]:
         recorded, learner = work_of(agent, batch_size, form)
         launched, other = work_of(agent, batch_size, dataclasses.replace(form, graph=False))
         for _ in range(5):
-            recorded()
-            launched()
+            recorded(0)
+            launched(0)
         pairs = zip(learner.networks.parameters(), other.networks.parameters(), strict=True)
         with torch.no_grad():
             apart = max(float((a - b).norm() / b.norm().clamp(min=1e-9)) for a, b in pairs)
@@ -136,7 +138,7 @@ def agrees(agent: str, batch_size: int) -> dict[str, float]:
             torch.cuda.set_sync_debug_mode("error")
         try:
             for _ in range(100 if torch.cuda.is_available() else 1):
-                recorded()
+                recorded(0)
         finally:
             if torch.cuda.is_available():
                 torch.cuda.set_sync_debug_mode("default")
@@ -167,10 +169,11 @@ def launches(agent: str) -> dict[str, int]:
     batch, counts = update.noise_batch(8), {}
     for name, at_once in (("one by one", False), ("at once", True)):
         learner = update.learner_of(agent, "bf16", torch.device("cpu"))
-        with patch.object(TwinCritic, "at_once", at_once):
-            learner.update(batch)
-            with Launches() as launches:
-                learner.update(batch)
+        for critic in critics(learner) if at_once else ():
+            join_heads(critic)
+        learner.update(batch, step=0)
+        with Launches() as launches:
+            learner.update(batch, step=0)
         counts[name] = launches.count
         print(f"twin critics {name}: {launches.count} operations")
     return counts
@@ -181,9 +184,7 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
     forms = {
         "as it is": Form(),
         "without a CUDA graph": Form(graph=False),
-        "twin critics one by one": Form(
-            change=lambda _: patch.object(TwinCritic, "at_once", False)
-        ),
+        "twin critics one by one": Form(change=one_by_one),
         "channels first": Form(change=channels_first),
         "compiled": Form(compiled=True),
         "fp32": Form(precision="fp32"),
@@ -201,7 +202,7 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
     for _ in range(repeats):
         for name, (work, learner) in works.items():
             with forms[name].change(learner):
-                rates[name].append(updates / seconds(work, updates))
+                rates[name].append(updates / seconds(partial(work, 0), updates))
     whole = median(rates.get("as it is", [float("nan")]))
     for name, each in rates.items():
         print(f"| {name} | {median(each):,.1f} | {median(each) / whole:.2f} |")
@@ -209,17 +210,34 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
     return {"updates_per_s": found, "batch_size": batch_size, "agent": agent} | circumstances()
 
 
+def critics(learner: DDPG) -> Iterator[TwinCritic]:
+    """Yield the critic and its target."""
+    for critic in (learner.networks.critic, learner.critic_target["critic"]):
+        assert isinstance(critic, TwinCritic)
+        yield critic
+
+
+@contextmanager
+def one_by_one(learner: DDPG) -> Iterator[None]:
+    """Let the critics compute their heads one by one."""
+    with ExitStack() as stack:
+        for critic in critics(learner):
+            forward = partial(TwinCritic.forward, critic)
+            stack.enter_context(patch.object(critic, "forward", forward))
+        yield
+
+
 def work_of(agent: str, batch_size: int, form: Form) -> tuple[UpdateOnDevice, DDPG]:
     """Return an update in the given form, recorded, and the agent that learns by it."""
     device = choose_device("auto")
     learner = update.learner_of(agent, form.precision, device, compiled=form.compiled)
-    replay = OnDevice([update.noise_replay()], device)
+    replay = DeviceReplay(update.noise_replay(), device)
     work = UpdateOnDevice(learner, replay, batch_size, seed=0)
     if not form.graph:
         work._recorded.WARM_UP = sys.maxsize
     with form.change(learner):
         for _ in range(Recorded.WARM_UP + 2):
-            work()
+            work(0)
         wait()
     return work, learner
 
@@ -239,7 +257,7 @@ def kernels(agent: str, batch_size: int, *, compiled: bool, updates: int = 20) -
     work, _ = work_of(agent, batch_size, Form(graph=False, compiled=compiled))
     kind = ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU
     with profile(activities=[kind]) as profiled:
-        seconds(work, updates)
+        seconds(partial(work, 0), updates)
     rows = []
     for event in profiled.key_averages():
         if on_gpu and event.device_type != DeviceType.CUDA:

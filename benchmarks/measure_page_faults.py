@@ -8,7 +8,6 @@ time, which excludes other load on the machine.
 
 from __future__ import annotations
 
-import dataclasses
 import resource
 import time
 from functools import partial
@@ -19,7 +18,8 @@ from gymnasium import spaces
 
 from merl.agents import make_agent
 from merl.bench.measuring import Work
-from merl.bench.update import as_sample, noise_batch, reference_of
+from merl.bench.update import as_sample, noise_batch, reference
+from merl.config import override
 from merl.core.resources import keep_freed_memory
 from merl.envs import make_env
 from merl.experiments.presets import compose
@@ -37,17 +37,20 @@ def main() -> None:
         assert isinstance(space, spaces.Dict)
         assert isinstance(actions, spaces.Box)
         config = compose(preset, task)
-        config = dataclasses.replace(
-            config, agent=dataclasses.replace(config.agent, precision="bf16")
-        )
+        config = override(config, {"agent.precision": "bf16"})
         agent = make_agent(
-            config.agent, space, actions, frame_stack=3, seed=0, device=torch.device("cpu")
+            config.agent_name,
+            config.agent,
+            space,
+            actions,
+            frame_stack=3,
+            seed=0,
+            device=torch.device("cpu"),
         )
         batch = random_batch(config, space, actions)
-        compare(preset, partial(agent.update, batch))
+        compare(preset, partial(agent.update, batch, step=0))
         env.close()
-    reference, sample = reference_of("merl"), as_sample(noise_batch(256), vector=True)
-    compare("the reference", partial(reference.update, sample))
+    compare("the reference", partial(reference().update, as_sample(noise_batch(256))))
 
 
 def compare(name: str, update: Work) -> None:

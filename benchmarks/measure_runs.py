@@ -56,9 +56,9 @@ def figures3and5() -> Iterator[tuple[str, str]]:
         "no-norm": "--agent.no-fusion-norm",
         "scheduled": "--agent.noise-std 1.0 --agent.noise-std-end 0.1 "
         f"--agent.noise-steps {REACH_STEPS // 2}",
-        "mlp64": "--agent.vector-encoder-dim 64",
-        "mlp128": "--agent.vector-encoder-dim 128",
-        "mlp256": "--agent.vector-encoder-dim 256",
+        "mlp64": "--agent.encoders.proprio mlp --agent.mlp-dim 64",
+        "mlp128": "--agent.encoders.proprio mlp --agent.mlp-dim 128",
+        "mlp256": "--agent.encoders.proprio mlp --agent.mlp-dim 256",
     }
     for name, flags in changes.items():
         yield f"reach_duplo-merl-{name}", f"reach_duplo {LAPTOP} --steps {REACH_STEPS} {flags}"

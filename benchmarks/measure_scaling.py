@@ -40,9 +40,8 @@ from merl.core import Transition
 from merl.core.resources import free_disk
 from merl.envs import make_env
 from merl.networks.augmentation import RandomShift, draw_shifts
-from merl.replay import EpisodeRing, ReplayConfig, pictures, replay_bytes, ring
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, buffer, frames
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
-from merl.training.timing import use_threads
 
 ROOT = Path(__file__).resolve().parent.parent
 CSV, FIGURE = ROOT / "results/scaling.csv", ROOT / "docs/images/scaling.png"
@@ -79,7 +78,6 @@ def main(
     """
     ask = {"batch": batches, "image": sides, "environments": environments}
     print(circumstances())
-    use_threads(torch.get_num_threads())
     with CSV.open() as file:
         rows: list[Any] = list(csv.reader(file))[1:]
     for question in questions:
@@ -108,7 +106,7 @@ def sides(repeats: int) -> Iterator[Row]:
             env = make_env("reach_duplo", renderer="raster", image_size=side)
             stack.callback(env.close)
             env.reset(seed=0)
-            works["step with its picture", side] = partial(env.step, np.zeros(ACTIONS, np.float32))
+            works["step with its image", side] = partial(env.step, np.zeros(ACTIONS, np.float32))
         yield from _rows("image", works, repeats)
 
 
@@ -131,13 +129,12 @@ def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
     seen = _episode()
     for compress, capacity in product((False, True), CAPACITIES):
         config = ReplayConfig(capacity=capacity, compress=compress)
-        with tempfile.TemporaryDirectory(dir=place) as folder, patch.object(ring, "check_fits"):
-            if replay_bytes(config, space_of(), ACTION_SPACE) > 0.9 * free_disk(Path(folder)):
+        spec = ReplaySpec.of(config, space_of(), ACTION_SPACE)
+        with tempfile.TemporaryDirectory(dir=place) as folder, patch.object(buffer, "check_fits"):
+            if spec.bytes > 0.9 * free_disk(Path(folder)):
                 print(f"{capacity:,} steps are skipped: the disk is too small")
                 continue
-            replay = EpisodeRing(
-                config, space_of(), ACTION_SPACE, directory=Path(folder) / "replay"
-            )
+            replay = ReplayBuffer(spec, Path(folder) / "replay")
             _fill(replay, seen, capacity)
             replay.flush()
             name, rng = "compressed" if compress else "raw", np.random.default_rng(0)
@@ -149,7 +146,7 @@ def capacities(repeats: int, place: Path | None) -> Iterator[Row]:
                 yield _row("replay", side, x, [1e3 * seconds / SAMPLES for seconds in each])
 
 
-def _samples(replay: EpisodeRing, rng: np.random.Generator) -> None:
+def _samples(replay: ReplayBuffer, rng: np.random.Generator) -> None:
     shifts = torch.Generator().manual_seed(0)
     for _ in range(SAMPLES):
         now, then = (RandomShift(draw_shifts(256, PAD, shifts), PAD) for _ in range(2))
@@ -157,7 +154,7 @@ def _samples(replay: EpisodeRing, rng: np.random.Generator) -> None:
 
 
 def _without_read_ahead(sample: Work) -> None:
-    with patch.object(pictures.ReadAhead, "is_wanted", False):
+    with patch.object(frames.ReadAhead, "is_wanted", False):
         sample()
 
 
@@ -187,13 +184,13 @@ def _episode() -> list[dict[str, Any]]:
     return seen
 
 
-def _fill(ring: EpisodeRing, seen: list[dict[str, Any]], steps: int) -> None:
+def _fill(replay: ReplayBuffer, seen: list[dict[str, Any]], steps: int) -> None:
     action = np.zeros(ACTIONS, np.float32)
     for step in range(steps):
         if step % EPISODE == 0:
-            ring.begin(seen[0])
+            replay.begin(seen[0])
         now = step % EPISODE + 1
-        ring.add(Transition(action, 0.0, 1.0, seen[now], last=now == EPISODE))
+        replay.add(Transition(action, 0.0, 1.0, seen[now], last=now == EPISODE))
 
 
 def draw() -> None:

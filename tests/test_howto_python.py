@@ -1,4 +1,4 @@
-"""The examples of docs/howto/python.md run, in a small form."""
+"""The examples of docs/howto/python.md and docs/howto/logging.md run, in a small form."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import merl
 from merl import api
 from merl.report.curves import read_metrics
 
-PAGE = Path(__file__).parents[1] / "docs/howto/python.md"
-TEXT = PAGE.read_text(encoding="utf-8")
+HOWTO = Path(__file__).parents[1] / "docs/howto"
+TEXT = "".join((HOWTO / page).read_text(encoding="utf-8") for page in ("python.md", "logging.md"))
 SNIPPETS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 SMALL: dict[str, Any] = {
     "steps": 40,
@@ -50,7 +50,7 @@ def test_the_examples_run_in_their_order(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(merl, "evaluate", partial(api.evaluate, max_episode_steps=20))
     names: dict[str, Any] = {}
     for snippet in SNIPPETS:
-        exec(compile(snippet, str(PAGE), "exec"), names)
+        exec(compile(snippet, str(HOWTO), "exec"), names)
     assert len(SNIPPETS) >= 9
     runs = {path.name for path in (tmp_path / "runs").iterdir()}
     assert runs == set(re.findall(r'run_dir="runs/(\w+)"', TEXT))

@@ -51,6 +51,7 @@ def test_the_wheel_has_all_files_of_the_package_and_its_metadata(wheel: Path) ->
         path.as_posix() for path in files if path.suffix in (".py", ".json", ".typed")
     }
     assert {"merl/py.typed", "merl/report/references.json"} < of_the_package <= names
+    assert "merl/bench/merl_minimal.py" in names  # the reference of `merl bench update`
     for line in (
         "Name: merl-rl",
         "License-Expression: MIT",
@@ -68,7 +69,9 @@ def test_the_wheel_has_all_files_of_the_package_and_its_metadata(wheel: Path) ->
 PROBE = """
 from importlib.metadata import version
 import merl
+from merl.bench.update import load_example
 from merl.report.references import references
+load_example().MERL
 print(merl.__file__, merl.__version__, version("merl-rl"), len(references("lift_box")))
 """
 

@@ -1,4 +1,4 @@
-"""The README's commands work in their order after `make train`, and its links exist."""
+"""README and tutorial: their commands work in their order after `make train`."""
 
 from __future__ import annotations
 
@@ -14,17 +14,21 @@ from merl.runs.run_folder import run_path
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+TUTORIAL = "".join(
+    (ROOT / "docs/tutorial" / page).read_text() for page in ("first_run.md", "results.md")
+)
 
 
-def commands() -> list[list[str]]:
+def commands(text: str) -> list[list[str]]:
     """Return the arguments of each line `$ merl ...` in the console blocks, in order."""
-    blocks = re.findall(r"```console\n(.*?)```", README, re.DOTALL)
+    blocks = re.findall(r"```console\n(.*?)```", text, re.DOTALL)
     lines = [line for block in blocks for line in block.splitlines()]
     return [shlex.split(line, comments=True)[2:] for line in lines if line.startswith("$ merl ")]
 
 
+@pytest.mark.parametrize(("text", "least"), [(README, 1), (TUTORIAL, 2)])
 def test_each_command_names_a_run_of_an_earlier_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    text: str, least: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     runs: set[Path] = set()
@@ -38,25 +42,24 @@ def test_each_command_names_a_run_of_an_earlier_command(
     (make_command,) = re.findall(r"\$\(BIN\)/merl (train .*)", makefile)
     assert main(make_command.replace("$(MINUTES)", "10").split()) == 0
     named = []
-    for command, *arguments in commands():
+    for command, *arguments in commands(text):
         assert command in COMMANDS
-        if command == "train" and "--help" not in arguments:
+        if command == "train":
             assert main([command, *arguments]) == 0
         if command in ("resume", "evaluate"):
             named.append(Path(arguments[0]).absolute())
-            assert named[-1] in runs
-    assert len(named) >= 4
-    loaded = re.findall(r'load_policy\("(.*?)"\)', README)
-    assert loaded
-    assert {Path(run).absolute() for run in loaded} <= runs
+    named += [Path(run).absolute() for run in re.findall(r'load_policy\("(.*?)"\)', text)]
+    assert len(named) >= least
+    assert set(named) <= runs
 
 
-def test_readme_explains_torch_without_cuda_and_the_package_name() -> None:
-    assert "--index-url https://download.pytorch.org/whl/cpu" in README
-    assert "merl-rl" in README
-    assert "another project" in README
+@pytest.mark.parametrize("text", [README, TUTORIAL])
+def test_torch_without_cuda_and_the_package_name_are_explained(text: str) -> None:
+    assert "--index-url https://download.pytorch.org/whl/cpu" in text
+    assert "merl-rl" in text
+    assert "another" in text
 
 
-def test_images_and_links_exist() -> None:
-    for target in re.findall(r'(?:\]\(|src=")([^)"#]+)', README):
-        assert target.startswith("https://") or (ROOT / target).exists(), target
+def test_the_readme_is_short_and_its_picture_is_small() -> None:
+    assert len(README.split()) <= 500
+    assert (ROOT / "docs/images/trained_arm.webp").stat().st_size <= 1_500_000

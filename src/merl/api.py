@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from merl.callbacks import Callback
-from merl.config import Setting, TrainConfig, override
+from merl.config import Device, Setting, TrainConfig, override
 from merl.core import MerlError
 from merl.envs.config import RendererName
 from merl.envs.user_env import MakeEnv, task_of
@@ -32,7 +32,7 @@ def train(
     *,
     env: MakeEnv | None = None,
     preset: str | None = None,
-    agent: str | None = None,
+    agent: str | type | None = None,
     setting: Setting = "matched",
     callbacks: Iterable[Callback] = (),
     progress: bool = True,
@@ -52,7 +52,8 @@ def train(
             `resume` and `evaluate` again.
         preset: the values that others override (`merl.experiments.presets.PRESETS`); if not given,
             `paper` on a machine with CUDA, else `laptop`. Ignored if `task` is a config.
-        agent: the agent's name; if not given, the preset's. Ignored if `task` is a config.
+        agent: the agent's name, or your own class of agent (docs/howto/agent.md); if not given, the
+            preset's. Ignored if `task` is a config.
         setting: `matched` (MERL's values) or `published` (those of the agent's authors). Ignored if
             `task` is a config.
         callbacks: called while it trains.
@@ -75,6 +76,8 @@ def train(
     if env is not None:
         name, make = task_of(env)
         overrides["task"] = name
+    if isinstance(agent, type):
+        agent = f"{agent.__module__}:{agent.__qualname__}"
     if not isinstance(task, TrainConfig):
         task = compose(preset or default_preset(), task or name, agent, setting)
     if overrides.get("run_dir") is not None:
@@ -88,7 +91,7 @@ def resume(
     env: MakeEnv | None = None,
     steps: int | None = None,
     minutes: float | None = None,
-    device: Literal["auto", "cpu", "cuda"] | None = None,
+    device: Device | None = None,
     callbacks: Iterable[Callback] = (),
     progress: bool = True,
     trust: bool = False,
@@ -112,7 +115,7 @@ def resume(
     Raises:
         MerlError: the run cannot be resumed; or see `Trainer.fit`.
     """
-    opened = Run.open(Path(run))
+    opened = Run.open(Path(run)).with_agent(trusted=trust)
     asked = resume_request(opened.config, steps, minutes, device)
     imports = env is None
     with resumption(opened, asked, ["device"], imports=imports, trusted=trust) as found:
@@ -143,13 +146,13 @@ def evaluate(
         video: record the first episode into this MP4 file.
         renderer: draws the images; if not given, the renderer of the training.
         max_episode_steps: cut an episode after this many steps; if not given, as in the run.
-        trust: import the environment that the run names although it was not trained on this
-            machine, which runs the code of whoever made the run.
+        trust: import the environment and the agent that the run names although it was not trained
+            on this machine, which runs the code of whoever made the run.
 
     Raises:
-        MerlError: the run cannot be loaded, or its environment is not trusted.
+        MerlError: the run cannot be loaded, or its code is not trusted.
     """
-    policy = load_policy(run, checkpoint=checkpoint)
+    policy = load_policy(run, checkpoint=checkpoint, trust=trust)
     return policy.evaluate(
         env=env,
         episodes=episodes,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from merl.core import CallbackFailed, MerlError
-from merl.envs.wrappers import in_one_line
+from merl.core.user_code import in_one_line
 from merl.evaluation.evaluation import Evaluation
 
 if TYPE_CHECKING:

@@ -6,40 +6,45 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 
 from merl.agents import AGENTS
-from merl.agents.config import AgentConfig
+from merl.agents.config import ObservationConfig
 from merl.core import MerlError, check_choice, counted, suggest
+from merl.core.fields import NOT_EMPTY, Range, check_fields
 from merl.envs.config import EnvConfig, StartName, UserEnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 Setting = Literal["matched", "published"]
 LoggerName = Literal["tensorboard", "wandb", "trackio"]
 
-MOST_STEPS = 10**12
-"""Upper limit of `steps` and similar fields, far beyond any real run."""
-MOST_ENVS = 1024
-"""Upper limit of `num_envs`, each of which may be a process."""
+Video = Literal["each", "last", "none"]
+Device = Literal["auto", "cpu", "cuda"]
+Steps = Annotated[int, Range(1, 10**12)]
+NotNegative = Annotated[int, Range(0)]
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
     """Settings of the evaluations: the agent acts without noise, from fixed start states."""
 
-    every: int = 10_000
+    every: NotNegative = 10_000
     """Steps between evaluations; 0 for no evaluation at all, not even at the end. Then only one
     instance of the environment is made, as a single physical robot requires."""
-    episodes: int = 10
+    episodes: Steps = 10
     """Number of episodes of each evaluation."""
-    start: tuple[StartName, ...] | None = None
+    start: Annotated[tuple[StartName, ...], NOT_EMPTY] | None = None
     """Start of the hand in evaluations (see `--start`); if not set, the same as in training."""
-    max_episode_steps: int = 2000
+    max_episode_steps: Steps = 2000
     """Limit in steps for evaluation episodes that do not end earlier."""
-    video: Literal["each", "last", "none"] = "each"
+    video: Video = "each"
     """Evaluations of which a video is made (of the first episode)."""
     references: bool = False
     """At the end, run 20 episodes with random actions and 20 with zero actions for comparison, if
@@ -47,10 +52,7 @@ class EvaluationConfig:
     this moves your robot at random."""
 
     def __post_init__(self) -> None:
-        for name, least in (("every", 0), ("episodes", 1), ("max_episode_steps", 1)):
-            if getattr(self, name) < least:
-                flag = name.replace("_", "-")
-                raise MerlError(f"eval.{flag} must be at least {least}, not {getattr(self, name)}")
+        check_fields(self, "eval.")
 
     def count(self, steps: int) -> int:
         """Return the number of evaluations in a run of `steps` steps."""
@@ -66,55 +68,54 @@ class TrainConfig:
     """
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-    """Task: reach_duplo, move_box, lift_box, the id of a Gymnasium environment, or module:function,
+    """Task: reach_duplo or another one of `merl tasks`, a Gymnasium id, or module:function,
     where the function makes an environment."""
-    preset: str = "paper"
+    preset: tyro.conf.Suppress[str] = "paper"
     """Set of default values for the other options: paper, laptop, state or smoke."""
-    agent_name: Annotated[str, tyro.conf.arg(name="agent", metavar="|".join(AGENTS))] = "merl"
-    """Agent and the observations that it uses. merl: camera and joints; drqv2: camera; proprio:
-    joints; merl_state, ddpg, sac: state."""
-    setting: Setting = "matched"
+    agent_name: tyro.conf.Suppress[str] = "merl"
+    """Name of the agent, which `agent` configures: a key of `AGENTS`, or `module:Class`."""
+    setting: tyro.conf.Suppress[Setting] = "matched"
     """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
     (published)."""
-    seed: int = 0
+    seed: NotNegative = 0
     """Seed of all randomness in the run."""
-    steps: int = 1_000_000
+    steps: Steps = 1_000_000
     """Number of environment steps."""
-    minutes: float | None = None
+    minutes: Annotated[float, Range(0, without=0)] | None = None
     """Time limit of the run in minutes, since start or resume."""
     run_dir: Path | None = None
     """Folder of the run, which must not exist yet; if not set, runs/TASK-AGENT-PRESET-sSEED (with
     -2, -3, ... if that exists)."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Device = "auto"
     """Device of the networks; auto uses CUDA if it is available."""
-    threads: int | None = None
+    threads: Steps | None = None
     """CPU threads of the update; if not set, one, or all of them if that is clearly faster."""
-    random_steps: int = 2000
+    random_steps: NotNegative = 2000
     """Steps with uniformly random actions at the start ("exploration steps" in Table 1)."""
-    seed_steps: int = 4000
+    seed_steps: NotNegative = 4000
     """Steps before the first update ("seed frames" in Table 1)."""
-    updates_per_step: float = 1.0
+    updates_per_step: Annotated[float, Range(0)] = 1.0
     """Updates per environment step; below 1, there is one update every few steps."""
-    action_repeat: int = 1
+    action_repeat: Steps = 1
     """Environment steps for which each action is repeated; all other options count environment
     steps."""
-    num_envs: int = 1
+    num_envs: Annotated[int, Range(1, 1024)] = 1
     """Number of parallel environments; if more than one, each runs in its own process."""
     synchronous: bool = True
     """Learn only after the environments have finished their step. With --no-synchronous they step
     in worker processes during the update, and an update does not use the newest step yet."""
-    worker_restarts: int = 10
+    worker_restarts: NotNegative = 10
     """Number of times that the worker processes are restarted because one died or did not answer;
     after that, the run is saved and ends."""
-    worker_timeout: float = 30.0
+    worker_timeout: Annotated[float, Range(0, 10**6, without=0)] = 30.0
     """Seconds within which a worker process must answer."""
-    save_every: float = 300.0
+    save_every: Annotated[float, Range(0)] = 300.0
     """Seconds between checkpoints; a checkpoint waits for the end of an episode, unless that takes
     much longer."""
     log: tuple[LoggerName, ...] = ()
     """Where to write the metrics, in addition to metrics.csv: tensorboard, wandb, trackio (each is
     an extra of this package)."""
-    keep: int = 2
+    keep: Steps = 2
     """Number of recent checkpoints to keep, in addition to the best one."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(
         default_factory=lambda: EnvConfig(renderer="gl")
@@ -123,33 +124,19 @@ class TrainConfig:
         default_factory=UserEnvConfig
     )
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    agent: AgentConfig = field(default_factory=lambda: AGENTS["merl"])
+    agent: ObservationConfig = field(default_factory=lambda: AGENTS["merl"].config)
     eval: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
-        check_choice("agent", self.agent_name, tuple(AGENTS))
-        kind = type(AGENTS[self.agent_name])
-        if type(self.agent) is not kind:
+        check_fields(self)
+        own_agent = ":" in self.agent_name
+        if not own_agent:
+            check_choice("agent", self.agent_name, tuple(AGENTS))
+        kind = ObservationConfig if own_agent else type(AGENTS[self.agent_name].config)
+        if not isinstance(self.agent, kind) or not (own_agent or type(self.agent) is kind):
             raise MerlError(
                 f"agent {self.agent_name!r} needs a config of type {kind.__name__}, not "
                 f"{type(self.agent).__name__}"
-            )
-        most = {"num_envs": MOST_ENVS}
-        for name in ("steps", "keep", "action_repeat", "num_envs"):
-            if not 1 <= getattr(self, name) <= most.get(name, MOST_STEPS):
-                raise MerlError(
-                    f"{name.replace('_', '-')} must be at least 1 and at most "
-                    f"{most.get(name, MOST_STEPS):,}, not {getattr(self, name)}"
-                )
-        for name in ("random_steps", "seed_steps", "seed", "worker_restarts"):
-            if getattr(self, name) < 0:
-                flag = name.replace("_", "-")
-                raise MerlError(f"{flag} must be at least 0, not {getattr(self, name)}")
-        if self.minutes is not None and not self.minutes > 0:
-            raise MerlError(f"minutes must be above 0, not {self.minutes}")
-        if not 0 < self.worker_timeout <= 1e6:  # a poll cannot wait for about 2e6 s or more
-            raise MerlError(
-                f"worker-timeout must be above 0 and at most 1e6 seconds, not {self.worker_timeout}"
             )
         if self.eval.start is not None and self.own_env:
             raise MerlError(
@@ -157,12 +144,6 @@ class TrainConfig:
                 "leave the option out"
             )
         _ = self.evaluated  # making this config checks its values
-        if self.threads is not None and self.threads < 1:
-            raise MerlError(f"threads must be at least 1, not {self.threads}")
-        for name in ("updates_per_step", "save_every"):
-            if not 0 <= getattr(self, name) < math.inf:
-                flag = name.replace("_", "-")
-                raise MerlError(f"{flag} must be finite and at least 0, not {getattr(self, name)}")
         if self.replay.batch_size > self.capacity:
             raise MerlError(
                 f"replay.batch-size {self.replay.batch_size} is more than the "
@@ -199,13 +180,14 @@ class TrainConfig:
         return min(self.replay.capacity, math.ceil(self.steps / self.action_repeat))
 
 
-def override(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
+def override(config: T, values: Mapping[str, Any], prefix: str = "") -> T:
     """Return a config with other values.
 
     Args:
         config: a config.
         values: {field: value}; the field of a nested config by its dotted name, e.g.
             `agent.noise_std`. A `-` in a name counts as `_`.
+        prefix: precedes the names in messages.
 
     Raises:
         MerlError: a name is unknown, or a value cannot work.
@@ -216,16 +198,24 @@ def override(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
     for name, value in values.items():
         first, _, rest = name.replace("-", "_").partition(".")
         if first not in names or (rest and not is_dataclass(getattr(config, first))):
-            raise MerlError(f"config {name!r} is unknown: {suggest(first, names)}")
+            raise MerlError(f"config {prefix}{name!r} is unknown: {suggest(first, names)}")
         if rest:
             nested.setdefault(first, {})[rest] = value
         else:
             changes[first] = value
     for first, inner in nested.items():
         part = changes.get(first, getattr(config, first))
-        known = [field.name for field in fields(part)]
-        for name in inner:
-            if name not in known:
-                raise MerlError(f"config {first}.{name!r} is unknown: {suggest(name, known)}")
-        changes[first] = replace(part, **inner)
+        changes[first] = override(part, inner, f"{prefix}{first}.")
     return replace(config, **changes)
+
+
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the value of every field by its name, as `override` takes them."""
+    values: dict[str, Any] = {}
+    for field_ in fields(config):
+        value = getattr(config, field_.name)
+        if is_dataclass(value):
+            values |= flat(value, f"{prefix}{field_.name}.")
+        else:
+            values[prefix + field_.name] = value
+    return values

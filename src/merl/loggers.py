@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from merl.callbacks import Callback
 from merl.config import LoggerName
 from merl.core import MerlError
-from merl.envs.wrappers import in_one_line
+from merl.core.user_code import in_one_line
 from merl.evaluation.evaluation import Evaluation
 from merl.runs.metrics import MetricsFile, append_whole
 from merl.runs.plain import to_plain

@@ -17,12 +17,10 @@ import psutil
 import pytest
 from rich.filesize import decimal
 from safetensors.torch import load_file
-from torch import Tensor
 
 from helpers import flat, wait_for
 from merl import cli
-from merl.agents.ddpg import DDPG, UpdateNoise
-from merl.core import Batch
+from merl.agents.ddpg import DDPG
 from merl.report.curves import read_metrics
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
@@ -139,10 +137,8 @@ def test_infos_of_several_environments_are_not_mixed(tmp_path: Path) -> None:
 def test_each_worker_has_different_episodes_and_its_own_ring(
     three: tuple[Path, str],
 ) -> None:
-    states = [
-        np.fromfile(three[0] / f"replay/{ring}/observation.state.bin", np.float32)
-        for ring in range(3)
-    ]
+    (file,) = (three[0] / "replay").rglob("observation.state.bin")
+    states = np.fromfile(file, np.float32).reshape(3, -1)
     assert all(np.count_nonzero(ring) >= 3 * 50 for ring in states)
     for one, other in ((0, 1), (0, 2), (1, 2)):
         assert not np.intersect1d(
@@ -330,13 +326,13 @@ def test_environments_step_during_an_update(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each step of the environment waits for an update that starts during the step."""
-    learn = DDPG.learn
+    plan = DDPG.plan
 
-    def recording(self: DDPG, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
-        (tmp_path / f"learns-{self.step + 1}").touch()
-        return learn(self, batch, draws)
+    def recording(self: DDPG, step: int) -> Any:
+        (tmp_path / f"learns-{step + 1}").touch()
+        return plan(self, step)
 
-    monkeypatch.setattr(DDPG, "learn", recording)
+    monkeypatch.setattr(DDPG, "plan", recording)
     flags = ["--no-synchronous", "--updates-per-step", "1", "--worker-timeout", "600"]
     assert train(tmp_path / "run", "waits_for_update", *flags) == 0
     assert read_metrics(tmp_path / "run")["step"][-1] == 100

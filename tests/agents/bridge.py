@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
-from merl.agents.update_noise import UpdateNoise
-from merl.core import Batch
+from merl.agents.sac import SACConfig
+from merl.core import Batch, UpdateNoise
 
 STACK = 3
 ACTIONS = 6
@@ -34,6 +34,8 @@ class Case:
         default_factory=lambda: {"image": (24, 28, 3)}
     )
     vectors: Mapping[str, int] = field(default_factory=lambda: {"proprio": 7})
+    depths: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
+    histories: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     batch: int = 8
     step: int = 0
 
@@ -41,9 +43,15 @@ class Case:
     def observation_space(self) -> spaces.Dict:
         images = {k: spaces.Box(0, 255, shape, np.uint8) for k, shape in self.images.items()}
         vectors = {
-            k: spaces.Box(-np.inf, np.inf, (n,), np.float32) for k, n in self.vectors.items()
+            k: spaces.Box(-np.inf, np.inf, shape, np.float32)
+            for k, shape in {**self._vector_shapes, **self.histories}.items()
         }
-        return spaces.Dict(images | vectors)
+        depths = {k: spaces.Box(0.0, 2.0, shape, np.float32) for k, shape in self.depths.items()}
+        return spaces.Dict(images | vectors | depths)
+
+    @property
+    def _vector_shapes(self) -> dict[str, tuple[int, ...]]:
+        return {key: (n,) for key, n in self.vectors.items()}
 
     @property
     def spec(self) -> reference.Spec:
@@ -51,16 +59,16 @@ class Case:
         c = self.config
         fusion = ("psi_critic",) if c.target == "heads_and_fusion" else ()
         return reference.Spec(
-            modalities=(*self.images, *self.vectors),
+            modalities=(*self.images, *self.depths, *self.vectors, *self.histories),
+            mlps=tuple(key for key, name in c.encoders.items() if name == "mlp"),
             strides=c.conv_strides,
-            vector_layers=2 if c.vector_encoder_dim else 0,
             layers=c.head_layers,
             head_norm=c.head_norm,
             fused=c.latent_dim > 0,
             fusion_norm=c.fusion_norm,
             shared={"decoupled": "", "shared": "critic", "shared_by_both": "both"}[c.fusion],
             critic_alone=c.privileged,
-            squash=c.squash,
+            squash=c.fusion_layer,
             pad=c.shift_pad,
             sigma=c.noise(self.step),
             clip=c.noise_clip,
@@ -74,7 +82,8 @@ class Case:
 
     def agent(self, seed: int = 0, actions: int = ACTIONS) -> DDPG:
         """Make the agent with the package."""
-        agent = make_agent(
+        return make_agent(
+            "sac" if isinstance(self.config, SACConfig) else "merl",
             self.config,
             self.observation_space,
             spaces.Box(-1, 1, (actions,), np.float32),
@@ -82,8 +91,12 @@ class Case:
             seed=seed,
             device=torch.device("cpu"),
         )
-        agent.step = self.step
-        return agent
+
+    def learn(
+        self, agent: DDPG, batch: Batch, noise: UpdateNoise | None = None
+    ) -> dict[str, Tensor]:
+        """Make an update at the step of the case."""
+        return agent.update(batch, noise, step=self.step)
 
     def batch_of(self, seed: int, dtype: torch.dtype = torch.float32) -> Batch:
         """Return a random batch, with discounts of zero and above zero."""
@@ -95,10 +108,16 @@ class Case:
                 for k, shape in self.images.items()
             }
             vectors = {
-                k: torch.from_numpy(rng.normal(size=(self.batch, n)).astype(np.float32)).to(dtype)
-                for k, n in self.vectors.items()
+                k: _tensor(rng.normal(size=(self.batch, *shape)), dtype)
+                for k, shape in {**self._vector_shapes, **self.histories}.items()
             }
-            return images | vectors
+            depths = {
+                k: torch.from_numpy(
+                    rng.integers(-9999, 9999, (self.batch, STACK, *shape), np.int16)
+                )
+                for k, shape in self.depths.items()
+            }
+            return images | depths | vectors
 
         steps = rng.integers(1, 4, self.batch)  # m, less than n = 3 where an episode ends sooner
         discount = np.where(np.arange(self.batch) % 3 == 0, 0.0, GAMMA**steps)
@@ -117,7 +136,7 @@ class Case:
             size = (self.batch, 2)
             return {
                 k: torch.randint(0, 2 * self.config.shift_pad + 1, size, generator=generator)
-                for k in self.images
+                for k in (*self.images, *self.depths)
             }
 
         def noise() -> Tensor:
@@ -181,12 +200,17 @@ def fill_adam_state(agent: DDPG, steps: int = 7, seed: int = 0) -> None:
 
 _NAMES = [
     (
-        r"encoders\.images\.(\w+)\.convolutions\.(\d+)\.",
+        r"encoders\.by_key\.(\w+)\.convolutions\.(\d+)\.",
         lambda m: f"xi.{m[1]}.{int(m[2]) // 2 + 1}.",
     ),
-    (r"encoders\.vectors\.(\w+)\.layers\.(\d+)\.", lambda m: f"zeta.{m[1]}.{int(m[2]) // 2 + 1}."),
+    (
+        r"encoders\.by_key\.(\w+)\.layers\.(\d+)\.",
+        lambda m: f"zeta.{m[1]}.{int(m[2]) // 2 + 1}.",
+    ),
+    (r"encoders\.by_key\.(\w+)\.(\d+)\.", lambda m: f"zeta.{m[1]}.{int(m[2]) // 2 + 1}."),
     (r"(critic|actor)_fusion\.projections\.(\w+)\.", r"psi_\1.\2."),
     (r"(critic|actor)_fusion\.norms\.(\w+)\.", r"psi_\1.\2.norm."),
+    (r"(critic|actor)_fusion\.attention\.", r"psi_\1.attention."),
     (r"critic\.q([12])\.(\d+)\.(linear\.)?", lambda m: f"phi_{m[1]}.{int(m[2]) + 1}."),
     (r"actor\.layers\.(\d+)\.(linear\.)?", lambda m: f"theta.{int(m[1]) + 1}."),
     (r"norm\.weight", "norm.scale"),
@@ -241,7 +265,7 @@ def state_of(agent: DDPG) -> reference.State:
 
 def sample_of(batch: Batch) -> reference.Sample:
     def to_double(x: Tensor) -> Tensor:
-        return x if x.dtype == torch.uint8 else x.to(torch.float64)
+        return x.to(torch.float64) if x.is_floating_point() else x
 
     return reference.Sample(
         o={k: to_double(v) for k, v in batch.observation.items()},

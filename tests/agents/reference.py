@@ -2,7 +2,7 @@
 
 It shares no code with the package: no layer, no optimizer, no helper. One flat dict holds every
 weight under its symbol in the paper, every random number is an argument, and one update is a pure
-function from a state to the next. `docs/paper.md` lists the choices that the paper leaves open.
+function from a state to the next. docs/explanation/paper.md lists what the paper leaves open.
 
     symbol          meaning
     xi.KEY          image encoder f of one camera
@@ -35,14 +35,14 @@ class Spec:
 
     modalities: tuple[str, ...] = ("image", "proprio")  # in the order of concatenation
     strides: tuple[int, ...] = (2, 1, 1, 1)
-    vector_layers: int = 0  # 0 is the identity, which the final version of MERL uses
+    mlps: tuple[str, ...] = ()  # modalities with an MLP; the final MERL uses the identity
     layers: int = 3  # of the actor and of each Q, including the output layer
     head_norm: bool = True
     fused: bool = True  # if False, the heads receive the concatenated encodings
     fusion_norm: bool = True
     shared: str = ""  # "", or the losses that train the shared fusion: "critic", "both"
     critic_alone: tuple[str, ...] = ()  # modalities that only the critic observes
-    squash: str = "tanh"  # or "simnorm"
+    squash: str = "tanh"  # or "simnorm", or "attention" with tanh
     simnorm_group: int = 8
     pad: int = 4
     sigma: float = 0.2
@@ -159,9 +159,13 @@ def aug(image: Tensor, shift: Tensor, pad: int) -> Tensor:
 
 
 def f(w: Weights, key: str, image: Tensor, spec: Spec) -> Tensor:
-    """C.1's image encoder: 3x3 convolutions with ReLU; pixels are scaled to 0..1, minus 0.5."""
+    """C.1's image encoder: 3x3 convolutions with ReLU; pixels are scaled to 0..1, minus 0.5.
+
+    The pixels are bytes, or 16-bit integers of depth.
+    """
     batch, frames, height, width, channels = image.shape
-    x = image.to(w[f"xi.{key}.1.weight"].dtype) / 255 - 0.5
+    low, span = (0, 255) if image.dtype == torch.uint8 else (-(2**15), 2**16 - 1)
+    x = (image.to(w[f"xi.{key}.1.weight"].dtype) - low) / span - 0.5
     x = x.permute(0, 1, 4, 2, 3).reshape(batch, frames * channels, height, width)
     for i, stride in enumerate(spec.strides, 1):
         x = relu(conv2d(x, w[f"xi.{key}.{i}.weight"], w[f"xi.{key}.{i}.bias"], stride))
@@ -169,11 +173,26 @@ def f(w: Weights, key: str, image: Tensor, spec: Spec) -> Tensor:
 
 
 def g(w: Weights, key: str, vector: Tensor, spec: Spec) -> Tensor:
-    """C.1's proprioception encoder: the identity, or an MLP with a ReLU after each layer."""
+    """C.1's proprioception encoder: the identity, or an MLP with a ReLU after each layer.
+
+    A history (B, T, n) has three convolutions over time instead.
+    """
     x = vector.to(w["theta.1.weight"].dtype)
-    for i in range(1, spec.vector_layers + 1):
+    if x.ndim == 3:
+        x = x.transpose(1, 2)
+        for i in range(1, 4):
+            x = relu(conv1d(x, w[f"zeta.{key}.{i}.weight"], w[f"zeta.{key}.{i}.bias"]))
+        return x.flatten(1)
+    for i in range(1, 3 if key in spec.mlps else 1):
         x = relu(linear(w, f"zeta.{key}.{i}", x))
     return x
+
+
+def conv1d(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Convolve (B, n, T) over three samples with stride 2, with a zero on each side."""
+    zero = torch.zeros_like(x[..., :1])
+    windows = torch.cat([zero, x, zero], -1).unfold(-1, 3, 2)  # (B, n, T / 2, 3)
+    return torch.einsum("bntk,onk->bot", windows, weight) + bias[:, None]
 
 
 def encode(w: Weights, o: Modalities, shift: dict[str, Tensor], spec: Spec) -> Modalities:
@@ -198,9 +217,34 @@ def h(w: Weights, psi: str, r: Modalities, spec: Spec) -> Tensor:
         x = linear(w, f"{psi}.{key}", r[key])
         if spec.fusion_norm:
             x = layer_norm(w, f"{psi}.{key}.norm", x)
-        return tanh(x) if spec.squash == "tanh" else simnorm(x, spec.simnorm_group)
+        return x
 
-    return torch.cat([one(key) for key in keys], -1)
+    parts = [one(key) for key in keys]
+    if spec.squash == "attention":
+        parts = attend(w, f"{psi}.attention", parts)
+    if spec.squash == "simnorm":
+        return torch.cat([simnorm(x, spec.simnorm_group) for x in parts], -1)
+    return torch.cat([tanh(x) for x in parts], -1)
+
+
+def attend(w: Weights, name: str, tokens: list[Tensor], heads: int = 4) -> list[Tensor]:
+    """Vaswani et al. (2017): x + attention of each token to all, without masks."""
+    x = torch.stack(tokens, 1)  # (B, M, c)
+    queries, keys, values = (
+        linear({"in.weight": weight, "in.bias": bias}, "in", x)
+        for weight, bias in zip(
+            w[f"{name}.in_proj_weight"].chunk(3), w[f"{name}.in_proj_bias"].chunk(3), strict=True
+        )
+    )
+    width = x.shape[-1] // heads
+    results = []
+    for part in range(heads):
+        cut = slice(part * width, (part + 1) * width)
+        scores = queries[..., cut] @ keys[..., cut].transpose(1, 2) / width**0.5  # (B, M, M)
+        share = scores.exp() / scores.exp().sum(-1, keepdim=True)
+        results.append(share @ values[..., cut])
+    x = x + linear(w, f"{name}.out_proj", torch.cat(results, -1))
+    return [x[:, index] for index in range(len(tokens))]
 
 
 # -- section 4.2: pi and Q -----------------------------------------------------------------------

@@ -19,7 +19,7 @@ VECTOR_ONLY = Case("vector-only", CONFIG, images={}, batch=20_000)  # no image: 
 
 
 def acts(agent: DDPG, case: Case, *, explore: bool, seed: int = 0) -> torch.Tensor:
-    return agent.act(case.batch_of(seed).observation, explore=explore)
+    return agent.act(case.batch_of(seed).observation, explore=explore, step=0)
 
 
 def with_mean(mean: float, **config: float) -> DDPG:
@@ -31,10 +31,10 @@ def with_mean(mean: float, **config: float) -> DDPG:
     return agent
 
 
-@pytest.mark.parametrize("squash", ["tanh", "simnorm"])
-def test_action_without_noise_equals_the_reference(squash: str) -> None:
+@pytest.mark.parametrize("layer", ["tanh", "simnorm", "attention"])
+def test_action_without_noise_equals_the_reference(layer: str) -> None:
     """Acting does not shift images, so the reference uses the crop in the middle."""
-    case = replace(WITH_IMAGE, config=replace(CONFIG, squash=squash))
+    case = replace(WITH_IMAGE, config=replace(CONFIG, fusion_layer=layer))
     agent = double(case.agent())
     weather(agent)
     w, spec = state_of(agent).weights, case.spec
@@ -43,7 +43,7 @@ def test_action_without_noise_equals_the_reference(squash: str) -> None:
     r_mm = reference.h(w, "psi_actor", reference.encode(w, o, middle, spec), spec)
     expected = reference.pi(w, r_mm, torch.zeros(case.batch, 6), spec)
     torch.testing.assert_close(
-        agent.act(o, explore=False).clone(), expected, rtol=1e-10, atol=1e-12
+        agent.act(o, explore=False, step=0).clone(), expected, rtol=1e-10, atol=1e-12
     )
 
 
@@ -102,7 +102,7 @@ def test_acting_does_not_change_learning() -> None:
     agent, twin = WITH_IMAGE.agent(), WITH_IMAGE.agent()
     acts(agent, WITH_IMAGE, explore=True)
     for each in (agent, twin):
-        each.update(WITH_IMAGE.batch_of(0))
+        each.update(WITH_IMAGE.batch_of(0), step=0)
     assert all(map(torch.equal, weights_of(agent).values(), weights_of(twin).values()))
 
 

@@ -16,7 +16,7 @@ from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SAC, SACConfig
-from merl.runs.checkpoint import load_agent, load_networks, save
+from merl.runs.checkpoint import load_agent, load_policy_of, save
 
 SMALL = {"hidden_dim": 16, "precision": "fp32"}
 VECTORS = {"images": {}, "vectors": {"state": 9}}
@@ -29,9 +29,9 @@ def case_of(config: AgentConfig, **values: object) -> Case:
     return Case("vectors", replace(config, **values), **VECTORS)
 
 
-def train(agent: DDPG, case: Case, updates: range) -> None:
+def train(agent: DDPG, case: Case, updates: range, step: int = 0) -> None:
     for seed in updates:
-        agent.update(case.batch_of(seed))
+        agent.update(case.batch_of(seed), step=step)
 
 
 # -- the actor is updated in every n-th update ----------------------------------------------------
@@ -44,7 +44,7 @@ def test_actor_is_updated_in_every_third_update(config: AgentConfig) -> None:
     changed: list[tuple[bool, bool]] = []
     for seed in range(7):
         before = weights_of(agent)
-        metrics = agent.update(case.batch_of(seed))
+        metrics = agent.update(case.batch_of(seed), step=0)
         after = weights_of(agent)
         actor, critic = (
             not torch.equal(before[name], after[name])
@@ -66,15 +66,6 @@ def test_saved_agent_keeps_the_count_of_updates() -> None:
     assert same(agent, resumed)
 
 
-def test_state_without_a_count_of_updates_can_be_loaded() -> None:
-    case = case_of(MERLConfig(latent_dim=16, **SMALL))
-    state = case.agent().state_dict()
-    del state["updates"]
-    agent = case.agent(seed=9)
-    agent.load_state_dict(state)
-    assert agent.updates == 0
-
-
 # -- a step size that decays ---------------------------------------------------------------------
 
 
@@ -84,11 +75,9 @@ def test_the_step_size_of_every_optimizer_decays_with_the_steps(config: AgentCon
     case = case_of(config, **values)
     agent, resumed = case.agent(), case.agent()
     for step, rate in ((0, 1e-3), (50, 5.5e-4), (100, 1e-4), (1000, 1e-4)):
-        agent.step = step
-        train(agent, case, range(1))
+        train(agent, case, range(1), step)
         resumed.load_state_dict(through_a_file(agent.state_dict()))
-        resumed.step = step
-        train(resumed, case, range(1))
+        train(resumed, case, range(1), step)
         for each in (agent, resumed):
             optimizers = [each.critic_optimizer, each.actor_optimizer]
             if isinstance(each, SAC):
@@ -114,7 +103,7 @@ def action_of(agent: DDPG, weights: Mapping[str, Tensor], case: Case) -> Tensor:
     """Return the action of an agent with these weights."""
     twin = replace(case, config=replace(case.config, actor_average=None)).agent()
     twin.networks.load_state_dict(weights)
-    return twin.act(case.batch_of(99).observation, explore=False)
+    return twin.act(case.batch_of(99).observation, explore=False, step=0)
 
 
 @AVERAGED
@@ -131,7 +120,7 @@ def test_evaluation_uses_the_average_and_exploration_the_newest_weights(
     fusion = "critic_fusion." if config.fusion == "shared_by_both" else "actor_fusion."
     averaged = newest()
     for seed in range(4):
-        agent.update(case.batch_of(seed))
+        agent.update(case.batch_of(seed), step=0)
         recent = newest()
         averaged |= {
             name: torch.lerp(averaged[name], recent[name], 0.25)
@@ -139,11 +128,11 @@ def test_evaluation_uses_the_average_and_exploration_the_newest_weights(
             if name.startswith((fusion, "actor."))
         }
     observation = case.batch_of(99).observation
-    deterministic = agent.act(observation, explore=False)
+    deterministic = agent.act(observation, explore=False, step=0)
     torch.testing.assert_close(deterministic, action_of(agent, recent | averaged, case))
     assert not torch.allclose(deterministic, action_of(agent, recent, case), atol=1e-3)
     if not isinstance(config, SACConfig):  # SAC's policy itself is random
-        exploring = agent.act(observation, explore=True)
+        exploring = agent.act(observation, explore=True, step=0)
         torch.testing.assert_close(exploring, action_of(agent, recent, case))
 
 
@@ -162,12 +151,12 @@ def test_checkpoint_includes_the_average(tmp_path: Path) -> None:
     agent, resumed, deployed = case.agent(), case.agent(seed=8), case.agent(seed=9)
     train(agent, case, range(3))
     saved = save(tmp_path, 3, agent, {}, score=None, keep=1)
-    load_networks(deployed.networks, saved)
+    load_policy_of(deployed, saved)
     load_agent(resumed, saved)
     observation = case.batch_of(99).observation
-    expected = agent.act(observation, explore=False)
+    expected = agent.act(observation, explore=False, step=0)
     for each in (resumed, deployed):
-        assert torch.equal(each.act(observation, explore=False), expected)
+        assert torch.equal(each.act(observation, explore=False, step=0), expected)
     for each in (agent, resumed):
         train(each, case, range(3, 5))
     assert same(agent, resumed)
@@ -193,6 +182,6 @@ def test_metrics_are_scalars_without_gradient(
     if isinstance(config, SACConfig):
         values = {name: value for name, value in values.items() if name != "critic_loss"}
     case = case_of(config, **values)
-    metrics = case.agent().update(case.batch_of(0))
+    metrics = case.agent().update(case.batch_of(0), step=0)
     assert not [name for name, value in metrics.items() if value.requires_grad or value.ndim]
     assert all(value.isfinite() for value in metrics.values())

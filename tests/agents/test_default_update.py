@@ -21,8 +21,7 @@ from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SAC, SACConfig
-from merl.agents.update_noise import UpdateNoise
-from merl.core import Batch
+from merl.core import Batch, UpdateNoise
 
 SMALL = {"conv_channels": 8, "hidden_dim": 32}
 CASES = [
@@ -155,8 +154,9 @@ def test_five_updates_equal_bit_for_bit(case: Case, precision: str) -> None:
     expected = WrittenOutSAC(agent) if sac else WrittenOut(agent)
     for seed in range(5):
         batch = case.batch_of(seed)
-        draws = agent.draw(case.batch)
-        agent.learn(batch, draws)
+        plan = agent.plan(case.step)
+        draws = agent.draw(case.batch, plan)
+        agent.learn(batch, draws, plan)
         expected.learn(batch, draws)
     found = agent.networks.state_dict() | {
         f"target.{name}": value for name, value in agent.critic_target.state_dict().items()

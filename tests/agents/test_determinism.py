@@ -12,19 +12,25 @@ from torch import Tensor
 
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
+from merl.core import UpdateNoise
 
 CASE = Case(
     "small",
     MERLConfig(
-        latent_dim=32, conv_channels=8, hidden_dim=32, vector_encoder_dim=8, precision="fp32"
+        latent_dim=32,
+        conv_channels=8,
+        hidden_dim=32,
+        encoders={"proprio": "mlp"},
+        mlp_dim=8,
+        precision="fp32",
     ),
 )
 
 
 def trained(agent: DDPG, updates: range) -> DDPG:
     for seed in updates:
-        agent.update(CASE.batch_of(seed))
-        agent.act(CASE.batch_of(seed).observation, explore=True)
+        agent.update(CASE.batch_of(seed), step=0)
+        agent.act(CASE.batch_of(seed).observation, explore=True, step=0)
     return agent
 
 
@@ -51,6 +57,10 @@ def contiguous(state: Any) -> Any:
     return [contiguous(value) for value in state] if isinstance(state, list) else state
 
 
+def drawn(agent: DDPG) -> UpdateNoise:
+    return agent.draw(CASE.batch, agent.plan(0))
+
+
 def test_same_seed_gives_the_same_weights() -> None:
     first, again, other = (trained(CASE.agent(seed), range(20)) for seed in (1, 1, 2))
     assert same(first, again)
@@ -63,7 +73,7 @@ def test_seed_determines_initial_weights() -> None:
 
 
 def test_seed_determines_update_noise() -> None:
-    first, again, other = (CASE.agent(seed).draw(CASE.batch) for seed in (1, 1, 2))
+    first, again, other = (drawn(CASE.agent(seed)) for seed in (1, 1, 2))
     assert torch.equal(first.next_noise, again.next_noise)
     assert torch.equal(first.shifts["image"], again.shifts["image"])
     assert not torch.equal(first.next_noise, other.next_noise)
@@ -80,7 +90,8 @@ def check_resumes_bit_for_bit(state: dict[str, Any], agent: DDPG) -> None:
     observation = CASE.batch_of(50).observation
     for explore in (False, True):
         assert torch.equal(
-            resumed.act(observation, explore=explore), agent.act(observation, explore=explore)
+            resumed.act(observation, explore=explore, step=0),
+            agent.act(observation, explore=explore, step=0),
         )
 
 

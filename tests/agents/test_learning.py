@@ -1,4 +1,4 @@
-"""Agents learn small tasks whose best return is known; docs/small_tasks.md has the figures."""
+"""Agents learn small tasks whose best return is known; see docs/explanation/small_tasks.md."""
 
 from __future__ import annotations
 

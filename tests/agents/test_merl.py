@@ -12,7 +12,7 @@ from gymnasium import spaces
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
-from merl.agents.networks import modalities
+from merl.agents.networks import observation_spec
 from merl.core import Batch, MerlError
 
 SPACE = spaces.Dict(
@@ -27,7 +27,7 @@ WITH_STATE = spaces.Dict({**SPACE, "state": spaces.Box(-np.inf, np.inf, (40,), n
 def make(config: MERLConfig, space: spaces.Dict = SPACE) -> DDPG:
     action_space = spaces.Box(-1, 1, (9,), np.float32)
     device = torch.device("cpu")
-    return make_agent(config, space, action_space, frame_stack=3, seed=0, device=device)
+    return make_agent("merl", config, space, action_space, frame_stack=3, seed=0, device=device)
 
 
 def test_defaults_are_those_of_table_1() -> None:
@@ -39,7 +39,7 @@ def test_defaults_are_those_of_table_1() -> None:
     assert config.hidden_dim == 1024
     assert config.latent_dim == 128
     assert (config.shift_pad, config.conv_channels, config.conv_strides) == (4, 32, (2, 1, 1, 1))
-    assert (config.target, config.squash, config.vector_encoder_dim) == ("heads", "tanh", 0)
+    assert (config.target, config.fusion_layer, config.encoders) == ("heads", "tanh", {})
 
 
 def test_networks_have_as_many_weights_as_in_the_paper() -> None:
@@ -62,11 +62,13 @@ def test_networks_have_as_many_weights_as_in_the_paper() -> None:
 
 
 def test_all_modalities_are_used_unless_keys_are_named() -> None:
-    assert modalities(MERLConfig(), WITH_STATE) == (("image",), ("proprio", "state"))
-    assert modalities(MERLConfig(vectors=("state",)), WITH_STATE) == (("image",), ("state",))
-    assert modalities(MERLConfig(images=()), WITH_STATE) == ((), ("proprio", "state"))
-    privileged_keys = MERLConfig(privileged=("state",))
-    assert modalities(privileged_keys, WITH_STATE) == (("image",), ("proprio",))
+    def senses(**values: Any) -> tuple[str, ...]:
+        return observation_spec(MERLConfig(**values), WITH_STATE, 3).senses
+
+    assert senses() == ("image", "proprio", "state")
+    assert senses(keys=("state", "image")) == ("image", "state")
+    assert senses(modalities=("vector", "sequence")) == ("proprio", "state")
+    assert senses(privileged=("state",)) == ("image", "proprio")
 
 
 def test_share_of_a_modality_is_rounded_down() -> None:
@@ -78,20 +80,29 @@ def test_share_of_a_modality_is_rounded_down() -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"images": ("camera",)}, "names 'camera'"),
-        ({"images": ("proprio",)}, "names 'proprio'"),
-        ({"vectors": ("joints",)}, "names 'joints'"),
-        ({"images": (), "vectors": ()}, "name some with --agent.images or --agent.vectors"),
-        ({"vectors": ("proprio", "proprio")}, "names 'proprio' twice"),
-        ({"images": (), "vectors": None, "privileged": ("image",)}, "names 'image'"),
+        ({"keys": ("camera",)}, r"names 'camera', but the observation has \['image', 'proprio'\]"),
+        ({"keys": ()}, "name some with --agent.keys"),
+        ({"keys": ("proprio", "proprio")}, "names 'proprio' twice"),
+        ({"modalities": ("depth",)}, "add --agent.modalities image vector"),
+        ({"encoders": {"wrist": "conv"}}, "agent.encoders names 'wrist'"),
+        ({"frozen_encoders": ("wrist",)}, "agent.frozen-encoders names 'wrist'"),
+        (
+            {"encoders": {"image": "conv1d"}},
+            "'image': encoder 'conv1d' does not fit a key of kind image: choose from conv",
+        ),
+        ({"encoders": {"proprio": "ident"}}, "'ident' is unknown: did you mean 'identity'"),
+        ({"encoder_weights": {"touch": "x"}}, "agent.encoder-weights names 'touch'"),
         ({"latent_dim": 3}, "3 leaves 1 for each of 2 modalities"),
         (
             {"latent_dim": 3, "privileged": ("state",)},
             r"each of 2 modalities \(image, proprio\): use at least 4",
         ),
-        ({"latent_dim": 24, "squash": "simnorm"}, "multiple of 8 per modality, not 12: use .* 16"),
         (
-            {"latent_dim": 120, "squash": "simnorm", "privileged": ("state",)},
+            {"latent_dim": 24, "fusion_layer": "simnorm"},
+            "multiple of 8 per modality, not 12: use .* 16",
+        ),
+        (
+            {"latent_dim": 120, "fusion_layer": "simnorm", "privileged": ("state",)},
             "not 60: use agent.latent-dim 16",
         ),
         ({"conv_strides": (4, 4, 4, 4)}, "84x84 pixels is too small"),
@@ -146,9 +157,9 @@ def test_observation_keys_may_have_any_name() -> None:
         "arm.joints": torch.zeros((1, 3)),
         "training": torch.zeros((1, 2)),
     }
-    assert agent.act(observation, explore=False).shape == (1, 9)
+    assert agent.act(observation, explore=False, step=0).shape == (1, 9)
     batch = Batch(
         observation, torch.zeros((1, 9)), torch.zeros(1), torch.ones(1), dict(observation)
     )
-    assert set(agent.draw(len(batch.action)).shifts) == {"type", "wrist camera"}
-    agent.update(batch)
+    assert set(agent.draw(len(batch.action), agent.plan(0)).shifts) == {"type", "wrist camera"}
+    agent.update(batch, step=0)

@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 import torch
 
+from merl.accelerate import twins
 from merl.agents import AGENTS, ddpg
-from merl.agents.update_noise import UpdateNoise
 from merl.bench.update import ACTIONS, learner_of, noise_batch
-from merl.networks import critic, encoders
+from merl.core import UpdateNoise
+from merl.networks import encoders
 
 DEVICE = torch.device("meta")
 
@@ -31,9 +32,8 @@ def _device(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(torch, "Generator", OnHost)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
-    for module in (encoders, critic):
+    for module in (encoders, twins):
         monkeypatch.setattr(module, "compute_dtype", lambda weight: weight.dtype)
-    monkeypatch.setattr(critic.TwinCritic, "at_once", True)
     monkeypatch.setattr(
         ddpg, "adam", lambda weights, *_, **__: torch.optim.Adam(weights, foreach=True)
     )
@@ -43,6 +43,14 @@ def draws(size: int) -> UpdateNoise:
     shifts = {"image": torch.zeros((size, 2), dtype=torch.int64, device=DEVICE)}
     noise = torch.zeros((size, ACTIONS), device=DEVICE)
     return UpdateNoise(shifts, shifts, noise, noise)
+
+
+def on_a_card(agent: str) -> ddpg.DDPG:
+    """Make an agent with both heads of the critic at once, as on a GPU."""
+    learner = learner_of(agent, "fp32", DEVICE)
+    for critic in (learner.networks.critic, learner.critic_target["critic"]):
+        twins.join_heads(critic)
+    return learner
 
 
 @pytest.mark.parametrize(
@@ -57,21 +65,22 @@ def draws(size: int) -> UpdateNoise:
 def test_update_does_not_wait_for_the_device(
     agent: str, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(AGENTS, agent, replace(AGENTS[agent], **values))
-    learner = learner_of(agent, "fp32", DEVICE)
+    kind = AGENTS[agent]
+    monkeypatch.setitem(AGENTS, agent, replace(kind, config=replace(kind.config, **values)))
+    learner = on_a_card(agent)
     batch = noise_batch(4).to(DEVICE)
     for _ in range(2):
-        metrics = learner.learn(batch, draws(4))
+        metrics = learner.update(batch, draws(4), step=0)
     assert {value.device for value in metrics.values()} == {DEVICE}
 
 
 def test_reading_a_value_or_another_device_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = learner_of("merl", "fp32", DEVICE)
+    learner = on_a_card("merl")
     batch = noise_batch(4).to(DEVICE)
     on_host = replace(batch, reward=torch.zeros(4))
     with pytest.raises(RuntimeError, match="meta"):
-        learner.learn(on_host, draws(4))
+        learner.learn(on_host, draws(4), learner.plan(0))
     step = learner.update_critic
     monkeypatch.setattr(learner, "update_critic", lambda *a: {"q": float(step(*a)["q"])})
     with pytest.raises(RuntimeError, match="meta"):
-        learner.learn(batch, draws(4))
+        learner.update(batch, draws(4), step=0)

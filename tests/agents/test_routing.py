@@ -12,7 +12,12 @@ from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 
 CONFIG = MERLConfig(
-    latent_dim=32, conv_channels=8, hidden_dim=32, vector_encoder_dim=16, precision="fp32"
+    latent_dim=32,
+    conv_channels=8,
+    hidden_dim=32,
+    encoders={"proprio": "mlp"},
+    mlp_dim=16,
+    precision="fp32",
 )
 CASE = Case("mlp", CONFIG)
 BOTH_TARGETS = pytest.mark.parametrize("target", ["heads", "heads_and_fusion"])
@@ -24,7 +29,7 @@ def agent_in_training(target: str = "heads") -> DDPG:
     """Make an agent and update it once, so that every network has a gradient."""
     agent = replace(CASE, config=replace(CONFIG, target=target)).agent()
     weather(agent)
-    agent.update(CASE.batch_of(0))
+    agent.update(CASE.batch_of(0), step=0)
     return agent
 
 
@@ -105,7 +110,11 @@ def test_target_moves_by_tau(target: str) -> None:
 def test_update_moves_the_target_once(target: str) -> None:
     agent = double(agent_in_training(target))
     before = weights_of(agent)
-    agent.learn(CASE.batch_of(2, torch.float64), draws_of(CASE.chance_of(2), CONFIG, torch.float64))
+    CASE.learn(
+        agent,
+        CASE.batch_of(2, torch.float64),
+        draws_of(CASE.chance_of(2), CONFIG, torch.float64),
+    )
     after = weights_of(agent)
     for name in [name for name in before if name.startswith("bar_")]:
         recent = after[name.removeprefix("bar_")]  # the critic's step came first
@@ -117,7 +126,7 @@ def test_tau_of_one_copies_the_critic() -> None:
     case = replace(CASE, config=replace(CONFIG, tau=1.0))
     agent = case.agent()
     weather(agent)
-    agent.update(case.batch_of(0))
+    agent.update(case.batch_of(0), step=0)
     weights = weights_of(agent)
     for name in weights:
         if name.startswith("bar_"):
@@ -140,7 +149,7 @@ def test_target_starts_as_a_copy_and_has_no_gradient(target: str) -> None:
     for name in weights:
         if name.startswith("bar_"):
             assert torch.equal(weights[name], weights[name.removeprefix("bar_")])
-    agent.update(CASE.batch_of(0))
+    agent.update(CASE.batch_of(0), step=0)
     assert not any(p.requires_grad for p in agent.critic_target.parameters())
     assert all(p.grad is None for p in agent.critic_target.parameters())
 

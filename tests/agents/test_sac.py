@@ -26,8 +26,7 @@ from bridge import (
 )
 
 from merl.agents.sac import SAC, SACConfig
-from merl.agents.update_noise import UpdateNoise
-from merl.core import Batch, MerlError
+from merl.core import Batch, MerlError, UpdateNoise
 
 SMALL = SACConfig(hidden_dim=32, precision="fp32")
 STATE = {"state": 9}
@@ -41,9 +40,9 @@ CASES = [
     ),
     Case(
         "camera-and-joints",
-        replace(SMALL, images=None, vectors=None, latent_dim=48, head_norm=True, conv_channels=8),
+        replace(SMALL, keys=None, latent_dim=48, head_norm=True, conv_channels=8),
     ),
-    Case("both-vectors", replace(SMALL, vectors=("state", "touch")), {}, {**STATE, "touch": 2}),
+    Case("both-vectors", replace(SMALL, keys=("state", "touch")), {}, {**STATE, "touch": 2}),
 ]
 
 
@@ -70,7 +69,7 @@ def test_five_updates_equal_the_reference(case: Case) -> None:
     target_entropy = case.config.target_entropy or -agent.networks.actor.layers[-1].out_features / 2
     for seed in range(5):
         chance, batch = case.chance_of(seed), case.batch_of(seed, torch.float64)
-        metrics = agent.learn(batch, draws_of(chance))
+        metrics = case.learn(agent, batch, draws_of(chance))
         sample = sample_of(case.batch_of(seed))
         truth, report = reference_sac.update(truth, sample, chance, case.spec, target_entropy)
         for name in ("critic_loss", "actor_loss", "alpha_loss", "entropy"):
@@ -119,9 +118,9 @@ def test_exploration_samples_and_evaluation_uses_the_mean() -> None:
     case = CASES[0]
     agent = case.agent()
     observation = case.batch_of(0).observation
-    deterministic = agent.act(observation, explore=False)
-    assert torch.equal(deterministic, agent.act(observation, explore=False))
-    sampled = torch.stack([agent.act(observation, explore=True) for _ in range(2000)])
+    deterministic = agent.act(observation, explore=False, step=0)
+    assert torch.equal(deterministic, agent.act(observation, explore=False, step=0))
+    sampled = torch.stack([agent.act(observation, explore=True, step=0) for _ in range(2000)])
     assert sampled.abs().max() <= 1
     mean, log_std = agent.networks.actor(
         agent.networks.actor_latent(agent.networks.encoders(observation))
@@ -148,7 +147,7 @@ def test_temperature_brings_the_entropy_to_its_target(target: float) -> None:
     generator = torch.Generator().manual_seed(0)
     seen = []
     for _ in range(2000):
-        metrics = agent.update(one_step_batch(generator))
+        metrics = agent.update(one_step_batch(generator), step=0)
         seen.append([float(metrics[name]) for name in ("entropy", "alpha", "q")])
     entropy, alpha, _ = np.mean(seen[-300:], axis=0)
     assert entropy == pytest.approx(target, abs=0.15)
@@ -160,10 +159,10 @@ def test_temperature_brings_the_entropy_to_its_target(target: float) -> None:
 def test_saved_agent_resumes_bit_for_bit() -> None:
     case = CASES[0]
     one, other = case.agent(), case.agent(seed=1)
-    one.update(case.batch_of(0))
+    one.update(case.batch_of(0), step=0)
     other.load_state_dict(one.state_dict())
     for agent in (one, other):
-        agent.update(case.batch_of(1))
+        agent.update(case.batch_of(1), step=0)
     assert isinstance(one, SAC)
     assert isinstance(other, SAC)
     assert torch.equal(one.log_alpha, other.log_alpha)

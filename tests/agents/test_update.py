@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import reference
@@ -26,29 +25,36 @@ from bridge import (
 )
 from torch import Tensor
 
-from merl.agents import ddpg
-from merl.agents.compiling import compile_parts
+from merl import modalities
+from merl.accelerate.networks import compile_forward, speed_up
+from merl.accelerate.twins import join_heads
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
-from merl.agents.networks import Networks
 from merl.networks import augmentation, representation
-from merl.networks.critic import TwinCritic
 
 SIZES = {"conv_channels": 8, "hidden_dim": 32, "precision": "fp32"}
 SMALL = MERLConfig(latent_dim=48, **SIZES)
 STATE = {"state": 9}
+MLP = {"encoders": {"proprio": "mlp"}, "mlp_dim": 20}
 TWO_CAMERAS = {"front": (24, 28, 3), "wrist": (26, 20, 1)}
 
 CASES = [
     Case("final", SMALL),
     Case("six-layers", replace(SMALL, head_layers=6)),
     Case("averaged-fusion", replace(SMALL, target="heads_and_fusion")),
-    Case("mlp-proprioception", replace(SMALL, vector_encoder_dim=20)),
+    Case("mlp-proprioception", replace(SMALL, **MLP)),
     Case("strides-2211", replace(SMALL, conv_strides=(2, 2, 1, 1))),
     Case("two-cameras", SMALL, images=TWO_CAMERAS),
     Case("two-vectors", SMALL, vectors={"joints": 5, "touch": 2}),
-    Case("simnorm", replace(SMALL, squash="simnorm")),
+    Case("simnorm", replace(SMALL, fusion_layer="simnorm")),
+    Case("attention", replace(SMALL, fusion_layer="attention")),
+    Case(
+        "every-kind",
+        replace(SMALL, fusion_layer="attention"),
+        depths={"depth": (20, 22, 1)},
+        histories={"force": (11, 3)},
+    ),
     Case("without-fusion-norm", replace(SMALL, fusion_norm=False)),
     Case("without-head-norm", replace(SMALL, head_norm=False)),
     Case("without-fusion", replace(SMALL, latent_dim=0)),
@@ -82,8 +88,8 @@ CASES = [
         replace(SMALL, critic_loss="hl_gauss", critic_low=-3.0),
         images={},
     ),
-    Case("proprio", replace(SMALL, images=()), images={}),
-    Case("merl-state", replace(SMALL, images=(), vectors=("state",)), images={}, vectors=STATE),
+    Case("proprio", replace(SMALL, modalities=("vector",)), images={}),
+    Case("merl-state", replace(SMALL, keys=("state",)), images={}, vectors=STATE),
     Case("drqv2", replace(DrQV2Config(), **SIZES, latent_dim=50), vectors={}, step=250_000),
     Case("ddpg", replace(DDPGConfig(), **SIZES), images={}, vectors=STATE),
     Case(
@@ -92,7 +98,7 @@ CASES = [
     ),
     Case(
         "all-at-once",
-        replace(SMALL, head_layers=6, target="heads_and_fusion", vector_encoder_dim=20),
+        replace(SMALL, head_layers=6, target="heads_and_fusion", **MLP),
         images=TWO_CAMERAS,
     ),
 ]
@@ -120,7 +126,7 @@ def prepared(case: Case, dtype: torch.dtype) -> DDPG:
 
 def learn(agent: DDPG, case: Case, seed: int, dtype: torch.dtype) -> dict[str, Tensor]:
     draws = draws_of(case.chance_of(seed), case.config, dtype, case.step)
-    return agent.learn(case.batch_of(seed, dtype), draws)
+    return case.learn(agent, case.batch_of(seed, dtype), draws)
 
 
 def expect(
@@ -212,33 +218,42 @@ def single_precision_errors(case: Case, seed: int) -> dict[str, float]:
     return losses | errors(gradients_of(agent), report.gradients)
 
 
+def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let cases make agents with the networks of a GPU, as far as their config asks for it."""
+    make = Case.agent
+
+    def agent(case: Case, *args: int) -> DDPG:
+        made = make(case, *args)
+        for critic in (made.networks.critic, made.critic_target["critic"]):
+            join_heads(critic)
+        speed_up(made)
+        if case.config.torch_compile == "yes":
+            compile_forward(made.networks.encoders)
+        return made
+
+    monkeypatch.setattr(Case, "agent", agent)
+
+
 TWINS_AT_ONCE = [case for case in CASES if case.name in ("six-layers", "without-head-norm")]
 
 
 @named_cases(*TWINS_AT_ONCE)
 def test_update_with_twins_at_once_as_on_a_gpu(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(TwinCritic, "at_once", True)
+    as_on_a_gpu(monkeypatch)
     check_in_double_precision(case, updates=5)
     check_single_precision(case)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("as_on_a_gpu", [False, True])
-def test_update_compiled(as_on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("on_a_gpu", [False, True])
+def test_update_compiled(on_a_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """This test takes a minute and needs a C++ compiler."""
     case = replace(CASES[0], config=replace(SMALL, torch_compile="yes"))
-    if as_on_a_gpu:
-
-        def compile_all(networks: Networks, *others: Any) -> None:
-            compile_parts(networks, *others)
-            networks.encoders.compile(dynamic=False)
-
-        monkeypatch.setattr(ddpg, "compile_parts", compile_all)
-        monkeypatch.setattr(TwinCritic, "at_once", True)
+    if on_a_gpu:
+        as_on_a_gpu(monkeypatch)
         monkeypatch.setattr(representation, "shift", augmentation._shift_by_index)
-        monkeypatch.setattr(augmentation, "_centred", augmentation._centred_at_once)
+        monkeypatch.setattr(modalities, "_minus_128", modalities._minus_128_at_once)
     check_in_double_precision(case, updates=5)
-    assert case.agent().networks.critic._compiled_call_impl is not None
     # In bf16, compiled code rounds elsewhere, but uses fp32 where eager mode does.
     gradients = []
     for compiled in ("no", "yes"):
@@ -325,11 +340,13 @@ def test_comparison_detects_another_value(change: dict[str, object]) -> None:
 # -- random numbers ------------------------------------------------------------------------------
 
 
-def test_update_is_draw_followed_by_learn() -> None:
+def test_update_is_plan_followed_by_draw_and_learn() -> None:
     case, agent, twin = CASES[0], CASES[0].agent(), CASES[0].agent()
     for seed in range(2):
         batch = case.batch_of(seed)
-        found, expected = agent.update(batch), twin.learn(batch, twin.draw(len(batch.action)))
+        plan = twin.plan(0)
+        found = agent.update(batch, step=0)
+        expected = twin.learn(batch, twin.draw(len(batch.action), plan), plan)
         assert found.keys() == expected.keys()
         assert all(torch.equal(found[name], expected[name]) for name in found)
     assert all(map(torch.equal, weights_of(agent).values(), weights_of(twin).values()))
@@ -340,7 +357,8 @@ def test_draw_returns_clipped_noise_and_independent_shifts() -> None:
     case = replace(CASES[5], batch=4000)
     batch = replace(CASES[5], batch=1).batch_of(0)
     batch = replace(batch, action=torch.zeros(case.batch, 6))
-    draws = case.agent().draw(len(batch.action))
+    agent = case.agent()
+    draws = agent.draw(len(batch.action), agent.plan(0))
     for noise in (draws.next_noise, draws.actor_noise):
         assert noise.shape == batch.action.shape
         assert noise.abs().max() == pytest.approx(0.3)
@@ -359,13 +377,16 @@ def test_draw_returns_clipped_noise_and_independent_shifts() -> None:
 
 def test_no_shift_is_drawn_if_shift_pad_is_0() -> None:
     case = replace(CASES[0], config=replace(SMALL, shift_pad=0))
-    assert case.agent().draw(case.batch).shifts == {}
+    agent = case.agent()
+    assert agent.draw(case.batch, agent.plan(0)).shifts == {}
     agent = double(case.agent())
     state = state_of(agent)
     batch = case.batch_of(0, torch.float64)
     chance = case.chance_of(0)
-    agent.learn(
-        batch, replace(draws_of(chance, case.config, torch.float64), shifts={}, next_shifts={})
+    case.learn(
+        agent,
+        batch,
+        replace(draws_of(chance, case.config, torch.float64), shifts={}, next_shifts={}),
     )
     _, report = reference.update(state, sample_of(batch), chance, case.spec)
     assert not beyond(errors(gradients_of(agent), report.gradients), 1e-8)

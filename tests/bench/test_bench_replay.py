@@ -22,7 +22,7 @@ def test_raw_and_compressed_replay_are_timed():
         assert result["sample_ms"][side]["median"] > 0
         assert result["ready_ms"][side]["median"] > 0
         assert result["gigabytes"][side] <= bench.BARS_GB[side]
-    assert result["picture_bytes"][bench.COMPRESSED] < result["picture_bytes"][bench.RAW] / 4
+    assert result["image_bytes"][bench.COMPRESSED] < result["image_bytes"][bench.RAW] / 4
 
 
 def test_too_little_disk_space_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

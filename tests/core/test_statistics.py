@@ -7,13 +7,11 @@ from merl.core.statistics import Interval, bootstrap_interval, wilson_interval
 def test_bootstrap_of_two_values_by_hand():
     # Resampled means: 0 with 1/4, 0.5 with 1/2, 1 with 1/4.
     assert bootstrap_interval([0.0, 1.0]) == Interval(0.5, 0.0, 1.0)
-    assert bootstrap_interval([0.0, 1.0], level=0.4) == Interval(0.5, 0.5, 0.5)
 
 
 def test_bootstrap_of_three_values_by_hand():
     # Resampled means: 0, 1, 2, 3 with 8/27, 12/27, 6/27, 1/27; 96.3 % of them are at most 2.
     assert bootstrap_interval([0.0, 0.0, 3.0]) == Interval(1.0, 0.0, 3.0)
-    assert bootstrap_interval([0.0, 0.0, 3.0], level=0.9) == Interval(1.0, 0.0, 2.0)
 
 
 def test_bootstrap_approaches_the_normal_interval():
@@ -24,10 +22,9 @@ def test_bootstrap_approaches_the_normal_interval():
     assert interval.high == pytest.approx(interval.mean + half, abs=0.2)
 
 
-def test_bootstrap_is_reproducible_with_a_seed():
+def test_bootstrap_of_the_same_sample_is_the_same():
     values = np.random.default_rng(2).normal(size=20)
-    assert bootstrap_interval(values, seed=3) == bootstrap_interval(values, seed=3)
-    assert bootstrap_interval(values, seed=3) != bootstrap_interval(values, seed=4)
+    assert bootstrap_interval(values) == bootstrap_interval(values)
 
 
 @pytest.mark.parametrize("values", [[0.1], [0.1] * 7])
@@ -59,11 +56,3 @@ def test_wilson_of_no_success_by_hand():
 def test_wilson_refuses_impossible_counts(successes, n):
     with pytest.raises(ValueError, match="trials"):
         wilson_interval(successes, n)
-
-
-@pytest.mark.parametrize("level", [0.0, 1.0, 95])
-def test_a_level_outside_zero_to_one_is_refused(level):
-    with pytest.raises(ValueError, match="level"):
-        bootstrap_interval([1.0, 2.0], level=level)
-    with pytest.raises(ValueError, match="level"):
-        wilson_interval(1, 2, level=level)

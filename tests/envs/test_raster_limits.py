@@ -16,14 +16,14 @@ from merl.envs.raster.renderer import RasterRenderer
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"samples": 0}, "samples is 0: give a whole number, at least 1 and at most 4"),
-        ({"samples": 5}, "samples is 5: .* at most 4"),
-        ({"samples": 2.0}, "samples is 2.0: give a whole number"),
-        ({"samples": True}, "samples is True: give a whole number"),
+        ({"samples": 0}, "samples must be at least 1 and at most 4, not 0"),
+        ({"samples": 5}, "samples must be .* at most 4, not 5"),
+        ({"samples": 2.0}, "samples must be a whole number, not 2.0"),
+        ({"samples": True}, "samples must be a whole number, not True"),
         ({"samples": 2, "size": 1025}, "samples is 2 at 1025 pixels, .* at most 2048"),
-        ({"size": 0}, "size is 0: .* at least 1"),
-        ({"size": 2049}, "size is 2049: .* at most 2048"),
-        ({"size": 8.5}, "size is 8.5: give a whole number"),
+        ({"size": 0}, "size must be at least 1 .*, not 0"),
+        ({"size": 2049}, "size must be .* at most 2,048, not 2049"),
+        ({"size": 8.5}, "size must be a whole number, not 8.5"),
     ],
 )
 def test_sizes_and_samples_out_of_range_are_rejected(every_geom, settings, message):

@@ -13,7 +13,8 @@ from test_user_envs import SpaceEnv, image, vector
 from merl.core import EnvironmentFailed, MerlError
 from merl.envs.config import UserEnvConfig
 from merl.envs.user_env import adapt
-from merl.envs.user_spaces import advice, brief, modality
+from merl.envs.user_spaces import advice, brief, user_key
+from merl.modalities import Depth, Modality, Sequence
 
 LARGEST32, LARGEST64 = float(np.finfo(np.float32).max), float(np.finfo(np.float64).max)
 
@@ -25,9 +26,9 @@ LARGEST32, LARGEST64 = float(np.finfo(np.float32).max), float(np.finfo(np.float6
 @pytest.mark.parametrize("size", [(48, 64), (84, 84), (40, 40)])
 def test_the_smaller_outer_axis_is_the_channel_axis(channels: int, size: tuple[int, int]) -> None:
     for shape, first in (((channels, *size), True), ((*size, channels), False)):
-        used = modality("camera", image(*shape), "auto")
+        used = user_key("camera", image(*shape), "auto")
         assert used is not None
-        assert (used.space.shape, used.channels_first) == ((*size, channels), first)
+        assert (used.modality.space.shape, used.channels_first) == ((*size, channels), first)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +49,7 @@ def test_an_ambiguous_image_layout_is_rejected(shape: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("shape", [(20, 30, 3), (3, 20, 30)])
 def test_an_image_in_another_layout_than_its_space_is_rejected(shape: tuple[int, ...]) -> None:
-    used = modality("camera", image(*shape), "auto")
+    used = user_key("camera", image(*shape), "auto")
     assert used is not None
     other = (3, 20, 30) if shape[-1] == 3 else (20, 30, 3)
     with pytest.raises(EnvironmentFailed, match=r"'camera' has shape .* but its space has"):
@@ -63,12 +64,12 @@ def test_an_unknown_layout_is_rejected() -> None:
 def test_an_image_keeps_the_bounds_of_its_pixels() -> None:
     mask = adapt(SpaceEnv(spaces.Box(0, 1, (20, 30), np.uint8)))
     assert mask.observation_space["image"] == spaces.Box(0, 1, (20, 30, 1), np.uint8)  # type: ignore[index]
-    used = modality("mask", spaces.Box(0, 1, (20, 30), np.uint8), "auto")
+    used = user_key("mask", spaces.Box(0, 1, (20, 30), np.uint8), "auto")
     assert used is not None
     used.convert(np.ones((20, 30), np.uint8))
     with pytest.raises(EnvironmentFailed, match="pixels from 0 to 255, but its space has 0 to 1"):
         used.convert(np.eye(20, 30, dtype=np.uint8) * 255)
-    used = modality("bright", spaces.Box(100, 255, (20, 30), np.uint8), "auto")
+    used = user_key("bright", spaces.Box(100, 255, (20, 30), np.uint8), "auto")
     assert used is not None
     with pytest.raises(EnvironmentFailed, match="pixels from 7 to 7, but its space has 100"):
         used.convert(np.full((20, 30), 7, np.uint8))
@@ -107,14 +108,14 @@ def test_numbers_along_one_axis_are_a_vector(box: spaces.Box) -> None:
         warnings.simplefilter("error")
         env = adapt(SpaceEnv(box))
         assert env.observation_space["state"].shape == (size,)  # type: ignore[index]
-        used = env.get_wrapper_attr("modalities")["state"]
+        used = env.get_wrapper_attr("keys")["state"]
         vector = used.convert(np.arange(size, dtype=box.dtype).reshape(box.shape))
     assert vector.dtype == np.float32
     np.testing.assert_array_equal(vector, np.arange(size))
 
 
 def test_a_number_beyond_float32_is_rejected() -> None:
-    used = modality("arm", vector(3, np.float64), "auto")
+    used = user_key("arm", vector(3, np.float64), "auto")
     assert used is not None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -122,6 +123,28 @@ def test_a_number_beyond_float32_is_rejected() -> None:
             with pytest.raises(EnvironmentFailed, match=r"'arm' is -?1e\+\d+ at index 1, .*beyond"):
                 used.convert(np.array([0.0, value, np.nan]))
         assert np.isinf(used.convert(np.array([0.0, np.inf, 0.0]))[1])  # the run's guard reports it
+
+
+# -- depth images and histories --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("space", "kind", "shape"),
+    [
+        (spaces.Box(0, 65535, (64, 48), np.uint16), Depth, (64, 48, 1)),
+        (spaces.Box(0.1, 9, (1, 64, 48), np.float64), Depth, (64, 48, 1)),
+        (spaces.Box(-1, 1, (3, 20), np.float32), Sequence, (3, 20)),
+        (spaces.Box(-1, 1, (4, 4), np.float64), Sequence, (4, 4)),
+    ],
+    ids=lambda value: brief(value) if isinstance(value, spaces.Space) else "",
+)
+def test_two_axes_are_a_depth_image_or_a_history(
+    space: spaces.Box, kind: type[Modality], shape: tuple[int, ...]
+) -> None:
+    used = user_key("x", space, "auto")
+    assert used is not None
+    assert (type(used.modality), used.modality.shape) == (kind, shape)
+    assert used.convert(space.sample()).shape == shape
 
 
 # -- advice ---------------------------------------------------------------------------------------
@@ -144,18 +167,18 @@ def test_a_number_beyond_float32_is_rejected() -> None:
         (spaces.Box(0, 255, (64, 64, 3), np.float32), "use a box with dtype=np.uint8", "255 *"),
         (spaces.Box(0, 255, (64, 64), np.int32), "use a box with dtype=np.uint8", "255 *"),
         (spaces.Box(-1, 1, (64, 64, 3), np.float32), "(127.5 * (x + 1))", "255 * x"),
-        (spaces.Box(0, 65535, (64, 64), np.uint16), "largest distance", "(255 * x)"),
-        (spaces.Box(0, np.inf, (64, 64, 1), np.float32), "largest distance", "(255 * x)"),
-        (spaces.Box(0, 9, (64, 64), np.float32), "largest distance", "dtype=np.uint8,"),
-        (spaces.Box(-1, 1, (3, 20), np.float32), "remove a wrapper that stacks", "uint8"),
-        (spaces.Box(-1, 1, (4, 4), np.float32), "flatten it to a box (16,)", "uint8"),
+        (spaces.Box(0, 65535, (64, 64, 3), np.uint16), "largest relevant value", "(255 * x)"),
+        (spaces.Box(0, np.inf, (64, 64, 1), np.float32), "the farthest one", "(255 * x)"),
+        (spaces.Box(-9, 9, (64, 64), np.float32), "the nearest distance (at least 0)", "np.uint8"),
+        (spaces.Box(-1, 1, (2, 3, 4), np.float32), "remove a wrapper that stacks", "uint8"),
+        (spaces.Box(-1, 1, (2, 4, 4), np.float32), "flattened to a box (32,)", "uint8"),
         (spaces.Box(0, 255, (4, 84, 84, 3), np.uint8), "--replay.frame-stack", "255 *"),
         (spaces.Box(0, 1, (0,), np.float32), "no numbers", "uint8"),
     ],
     ids=lambda value: brief(value) if isinstance(value, spaces.Space) else "",
 )
 def test_the_advice_matches_the_space(space: Any, message: str, excluded: str) -> None:
-    assert modality("x", space, "auto") is None
+    assert user_key("x", space, "auto") is None
     assert message in advice(space)
     assert excluded not in advice(space)
     assert len(brief(space)) <= 100
@@ -169,11 +192,11 @@ def test_the_advice_matches_the_space(space: Any, message: str, excluded: str) -
 
 
 def test_a_flat_dict_is_not_reported_as_nested() -> None:
-    flat = spaces.Dict({"gear": spaces.Discrete(3), "depth": spaces.Box(0, 9, (64, 64))})
+    flat = spaces.Dict({"gear": spaces.Discrete(3), "depth": spaces.Box(0, np.inf, (64, 64))})
     with pytest.raises(MerlError, match="neither an image") as caught:
         adapt(SpaceEnv(flat))
     assert "'gear' is Discrete(3)" in str(caught.value)
-    assert "'depth' is a float32 box (64, 64) from 0 to 9" in str(caught.value)
+    assert "'depth' is a float32 box (64, 64) from 0 to inf" in str(caught.value)
     assert "nested" not in str(caught.value)
 
 

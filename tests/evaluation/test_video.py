@@ -72,12 +72,6 @@ def test_odd_sides_lose_one_row_or_column(tmp_path):
     assert decode(tmp_path / "a.mp4")[2].shape == (1, 484, 640, 3)
 
 
-def test_frames_are_scaled_to_the_given_size(tmp_path):
-    with VideoWriter(tmp_path / "a.mp4", size=(600, 500)) as video:
-        video.add(make_frame(), {"return": 1.0})
-    assert decode(tmp_path / "a.mp4")[2].shape == (1, 500, 600, 3)
-
-
 @pytest.mark.parametrize(
     ("width", "height", "size"),
     [(84, 84, (504, 504)), (32, 64, (512, 1024)), (500, 479, (1000, 958))],
@@ -134,15 +128,12 @@ def test_refuses_invalid_frames(tmp_path, frame):
     assert names(tmp_path) == []
 
 
-def test_refuses_a_frame_of_another_shape_and_odd_sizes(tmp_path):
+def test_refuses_a_frame_of_another_shape(tmp_path):
     video = VideoWriter(tmp_path / "a.mp4")
     video.add(make_frame())
     with pytest.raises(MerlError, match="but the first one had"):
         video.add(make_frame(height=500))
     video.abort()
-    for size in ((481, 480), (480, 478)):
-        with pytest.raises(ValueError, match="even"):
-            VideoWriter(tmp_path / "a.mp4", size=size)
     assert names(tmp_path) == []
 
 

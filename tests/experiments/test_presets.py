@@ -24,7 +24,7 @@ def test_preset_paper_is_table_1() -> None:
     assert (agent.learning_rate, agent.tau, agent.latent_dim) == (1e-4, 0.01, 128)
     assert (agent.noise_std, agent.noise_clip, agent.shift_pad) == (0.2, 0.3, 4)
     assert (agent.conv_channels, agent.conv_strides) == (32, (2, 1, 1, 1))
-    assert (agent.hidden_dim, agent.vector_encoder_dim) == (1024, 0)
+    assert (agent.hidden_dim, agent.encoders) == (1024, {})
 
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "paper"])
@@ -63,11 +63,12 @@ def test_head_layers_of_preset_paper_depend_on_the_task(task: str, layers: int) 
 def test_every_preset_accepts_every_agent() -> None:
     for preset, chosen in PRESETS.items():
         assert compose(preset, "lift_box").agent_name == chosen.agent_name
-        for name, agent in AGENTS.items():
+        for name, kind in AGENTS.items():
+            agent = kind.config
             config = compose(preset, "lift_box", name)
             assert (config.preset, config.agent_name) == (preset, name)
             assert type(config.agent) is type(agent)
-            assert (config.agent.images, config.agent.vectors) == (agent.images, agent.vectors)
+            assert (config.agent.keys, config.agent.modalities) == (agent.keys, agent.modalities)
             for field, value in chosen.agent.items():
                 assert getattr(config.agent, field) == value
 
@@ -78,7 +79,7 @@ def test_setting_published_has_the_authors_values() -> None:
     # the noise falls over 500,000 actions of two steps each
     assert (drqv2.agent.noise(0), drqv2.agent.noise(500_000)) == (1.0, pytest.approx(0.55))
     assert drqv2.agent.noise(10**7) == pytest.approx(0.1)
-    assert drqv2.agent == dataclasses.replace(AGENTS["drqv2"], noise_steps=1_000_000)
+    assert drqv2.agent == dataclasses.replace(AGENTS["drqv2"].config, noise_steps=1_000_000)
     ddpg = compose("state", "reach_duplo", "ddpg", "published")
     assert (ddpg.agent.noise_std, ddpg.agent.noise_clip, ddpg.agent.hidden_dim) == (0.1, 0.0, 256)
     assert (ddpg.replay.n_step, ddpg.random_steps, ddpg.seed_steps) == (1, 25_000, 25_000)

@@ -12,7 +12,6 @@ from merl.networks.augmentation import (
     _shift_by_index,
     draw_shifts,
     shift,
-    to_input,
 )
 
 SHAPES = [(1, 3, 84, 84, 3), (5, 2, 9, 12, 1), (3, 1, 4, 3, 3)]  # (B, K, H, W, C)
@@ -122,31 +121,3 @@ def test_generator_determines_shifts() -> None:
     )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
-def test_input_has_centred_pixels_in_channel_order(
-    shape: tuple[int, ...], dtype: torch.dtype
-) -> None:
-    images = random_images(shape)
-    batch, stack, height, width, channels = shape
-    x = to_input(images, dtype)
-    assert x.dtype == dtype
-    assert x.shape == (batch, stack * channels, height, width)
-    for frame in range(stack):  # the oldest first, its channels together
-        for channel in range(channels):
-            expected = images[:, frame, :, :, channel].to(torch.float64) - 128
-            assert torch.equal(x[:, frame * channels + channel].to(torch.float64), expected)
-
-
-def test_input_is_exact_for_every_byte() -> None:
-    images = torch.arange(256, dtype=torch.uint8).reshape(256, 1, 1, 1, 1)
-    x = to_input(images, torch.bfloat16)
-    assert torch.equal(x.flatten().long(), torch.arange(256) - 128)
-    assert torch.equal(images.flatten().long(), torch.arange(256))  # unchanged
-
-
-def test_input_is_channels_last() -> None:
-    x = to_input(random_images((2, 3, 8, 9, 3)), torch.float32)
-    assert x.is_contiguous(memory_format=torch.channels_last)

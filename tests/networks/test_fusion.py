@@ -46,6 +46,6 @@ def test_each_modality_changes_only_its_part() -> None:
 
 
 def test_simnorm_groups_sum_to_one() -> None:
-    latent = Fusion(FEATURES, 16, squash="simnorm")(encoded(FEATURES))
+    latent = Fusion(FEATURES, 16, layer="simnorm")(encoded(FEATURES))
     assert latent.min() > 0
     torch.testing.assert_close(latent.unflatten(-1, (4, 8)).sum(-1), torch.ones(64, 4))

@@ -40,29 +40,3 @@ def test_twin_heads_share_no_weights() -> None:
     assert all((a is None) != (b is None) for a, b in zip(one, two, strict=True))
     (by_action,) = torch.autograd.grad(critic(latent, action.requires_grad_())[0].sum(), [action])
     assert by_action.any(dim=0).all()
-
-
-@pytest.mark.parametrize("layers", [1, 4])
-@pytest.mark.parametrize("norm", ["layer", "none"])
-def test_twins_at_once_equal_twins_one_by_one(layers: int, norm: Norm) -> None:
-    """Compare values, and gradients of the action and of every weight, also in bf16."""
-    critic = TwinCritic(10, 4, HeadSize(layers, 32, norm)).double()
-    for parameter in critic.parameters():
-        nn.init.normal_(parameter, 0.0, 0.3)
-    latent, action = torch.randn(50, 10), torch.rand(50, 4, requires_grad=True)
-
-    def values_and_gradients(dtype: torch.dtype, at_once: bool) -> list[torch.Tensor]:
-        critic.at_once = at_once
-        critic.to(torch.float64 if dtype == torch.float64 else torch.float32)
-        state = latent.to(next(critic.parameters()).dtype)
-        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-            q1, q2 = critic(state, action.to(state.dtype))
-        inputs = [action, *critic.parameters()]
-        return [q1, q2, *torch.autograd.grad((q1 * q2).sum(), inputs)]
-
-    for dtype, bound in ((torch.float64, 1e-12), (torch.float32, 1e-5), (torch.bfloat16, 1e-5)):
-        one_by_one, at_once = (values_and_gradients(dtype, way) for way in (False, True))
-        for a, b in zip(at_once, one_by_one, strict=True):
-            assert a.shape == b.shape
-            assert a.dtype == b.dtype
-            assert (a - b).norm() <= bound * b.norm()

@@ -31,7 +31,9 @@ def networks() -> nn.Module:
             "proprio": spaces.Box(-1, 1, (7,), np.float32),
         }
     )
-    config = MERLConfig(latent_dim=64, hidden_dim=48, vector_encoder_dim=20, head_layers=4)
+    config = MERLConfig(
+        latent_dim=64, hidden_dim=48, mlp_dim=20, encoders={"proprio": "mlp"}, head_layers=4
+    )
     torch.manual_seed(0)
     return make_networks(config, space, 6, 3)
 

@@ -21,7 +21,7 @@ from merl.config import TrainConfig
 from merl.core import MerlError, Transition
 from merl.evaluation.policy import Policy
 from merl.networks.settings import torch_settings
-from merl.replay import ReplayBuffer, ReplayConfig
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.runs import checkpoint
 from merl.training.loop import Randomness
 from merl.training.updating import make_update
@@ -103,29 +103,29 @@ def disturbed(by: str) -> Iterator[None]:
 
 def results(config: AgentConfig, folder: Path) -> list[Any]:
     """Build an agent, act, learn from a replay, save and load; return all results."""
-    agent = make_agent(config, SPACE, ACTIONS, frame_stack=3, seed=0, device=CPU, threads=1)
+    agent = make_agent("merl", config, SPACE, ACTIONS, frame_stack=3, seed=0, device=CPU, threads=1)
     with torch_settings(CPU):
-        replay = ReplayBuffer(CONFIG.replay, SPACE, ACTIONS, count=1, directory=None, capacity=20)
+        replay = ReplayBuffer(ReplaySpec.of(CONFIG.replay, SPACE, ACTIONS, capacity=20))
     env = DotEnv()
     observation, _ = env.reset(seed=0)
-    replay.rings[0].begin(observation)
+    replay.begin(observation)
     policy = Policy(agent, CONFIG, SPACE, CPU)
     for step in range(9):
         action = np.full(1, step / 10, np.float32)
         observation = env.step(action)[0]
-        replay.rings[0].add(Transition(action, step / 10, 1.0, observation, last=False))
-    update = make_update(agent, replay, Randomness(0), CONFIG, print)
-    metrics = [update() for _ in range(2)][-1]
+        replay.add(Transition(action, step / 10, 1.0, observation, last=False))
+    update = make_update(agent, replay, Randomness(0), CONFIG, CPU, print)
+    metrics = [update(0) for _ in range(2)][-1]
     saved = checkpoint.save(folder, 1, agent, {}, score=None, keep=1)
-    again = make_agent(config, SPACE, ACTIONS, frame_stack=3, seed=1, device=CPU, threads=1)
+    again = make_agent("merl", config, SPACE, ACTIONS, frame_stack=3, seed=1, device=CPU, threads=1)
     checkpoint.load_agent(again, saved)
-    update_again = make_update(again, replay, Randomness(1), CONFIG, print)
-    update_again()
-    checkpoint.load_networks(agent.networks, saved)
+    update_again = make_update(again, replay, Randomness(1), CONFIG, CPU, print)
+    update_again(0)
+    checkpoint.load_policy_of(agent, saved)
     return [
         *(parameter.detach().clone().numpy() for parameter in again.networks.parameters()),
         *(value.detach().clone().numpy() for value in metrics.values()),
-        again.act({k: v[:1] for k, v in policy_input(observation).items()}, explore=True).numpy(),
+        again.act(policy_input(observation), explore=True, step=0).numpy(),
         policy(observation),
     ]
 
@@ -156,11 +156,13 @@ def test_agent_does_not_depend_on_torch_settings(
 @pytest.mark.parametrize("by", ["all", "inference"])
 def test_sac_does_not_depend_on_torch_settings(by: str) -> None:
     def weights() -> list[Any]:
-        config = AGENTS["sac"]
+        config = AGENTS["sac"].config
         space = gymnasium.spaces.Dict({"state": SPACE["joint"]})
-        agent = make_agent(config, space, ACTIONS, frame_stack=1, seed=0, device=CPU, threads=1)
+        agent = make_agent(
+            "sac", config, space, ACTIONS, frame_stack=1, seed=0, device=CPU, threads=1
+        )
         seen = torch.from_numpy(np.ones((1, 2), np.float32))
-        action = agent.act({"state": seen}, explore=True)
+        action = agent.act({"state": seen}, explore=True, step=0)
         agent.load_state_dict(agent.state_dict())
         return [action.numpy(), *(p.detach().numpy() for p in agent.networks.parameters())]
 

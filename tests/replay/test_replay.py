@@ -10,7 +10,7 @@ import mmap
 import os
 import resource
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,17 +23,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from helpers import wait_for
+from merl.accelerate.device_replay import DeviceReplay
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.replay import (
-    EpisodeRing,
-    ReplayBuffer,
-    ReplayConfig,
-    check_fits,
-    pictures,
-    replay_bytes,
-    storage,
-)
-from merl.replay.pictures import ReadAhead
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, check_fits, frames
+from merl.replay.frames import ReadAhead
+from merl.replay.ring import EpisodeRing
+from merl.replay.spec import KeySpec, span_name
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
 OBSERVATIONS = gymnasium.spaces.Dict(
@@ -47,8 +42,12 @@ def config(**values: Any) -> ReplayConfig:
     return ReplayConfig(**{"capacity": 20, "batch_size": 1, "discount": 0.9} | values)
 
 
-def make(directory: Path | None = None, **values: Any) -> EpisodeRing:
-    return EpisodeRing(config(**values), OBSERVATIONS, ACTIONS, directory=directory)
+def spec_of(config: ReplayConfig, **values: Any) -> ReplaySpec:
+    return ReplaySpec.of(config, OBSERVATIONS, ACTIONS, **values)
+
+
+def make(directory: Path | None = None, **values: Any) -> ReplayBuffer:
+    return ReplayBuffer(spec_of(config(**values)), directory)
 
 
 def observe(episode: int, t: int) -> dict[str, np.ndarray]:
@@ -93,7 +92,6 @@ class Account:
     )  # (episode, t) of all ever written
     ended: set[int] = field(default_factory=set)  # episodes that truly ended
     lost: int = 0  # number of oldest timesteps that are overwritten
-    length: int = 0  # number of slots, if it is more than the capacity requires
 
     @property
     def slots(self) -> int:
@@ -101,9 +99,7 @@ class Account:
         least = config.frame_stack + 2
         if config.compress:
             least = 5 * (least + 1)
-        return self.length or max(
-            config.capacity + config.capacity // 200 + config.frame_stack, least
-        )
+        return max(config.capacity + config.capacity // 200 + config.frame_stack, least)
 
     def record(self, episode: int, t: int) -> None:
         self.timesteps.append((episode, t))
@@ -132,7 +128,9 @@ class Account:
         return total, weight, t
 
 
-def write(replay: EpisodeRing, account: Account, episode: int, t: int, plan: Episode) -> None:
+def write(
+    replay: ReplayBuffer | EpisodeRing, account: Account, episode: int, t: int, plan: Episode
+) -> None:
     """Write timestep t of an episode to the replay and to the account."""
     if t == 0:
         replay.begin(observe(episode, 0))
@@ -148,7 +146,7 @@ def write(replay: EpisodeRing, account: Account, episode: int, t: int, plan: Epi
     account.record(episode, t)
 
 
-def check(replay: EpisodeRing, account: Account) -> None:
+def check(replay: ReplayBuffer, account: Account) -> None:
     """Compare all steps that the replay can sample with the account."""
     held = account.held()
     assert len(replay) == len(held)
@@ -189,7 +187,7 @@ plans = st.lists(
 
 
 def brute_force(settings: ReplayConfig, episodes: list[Episode]) -> None:
-    replay = EpisodeRing(settings, OBSERVATIONS, ACTIONS)
+    replay = ReplayBuffer(spec_of(settings))
     account = Account(settings)
     for episode, plan in enumerate(episodes):
         for t in range(plan.length + 1):
@@ -280,12 +278,12 @@ def test_same_generator_and_contents_give_the_same_batch():
 def test_read_ahead_requests_exactly_the_batch(tmp_path, monkeypatch, compress, n_step):
     """With n_step 6 the images between o_t and o_{t+n} are not requested."""
     replay = make(tmp_path / "ring", capacity=30, compress=compress, n_step=n_step)
-    account = Account(replay.config)
+    account = Account(replay.spec.config)
     for episode in range(9):  # the ring wraps
         for t in range(8):
             write(replay, account, episode, t, Episode(7, "limit"))
     requested, indices, pick = [], [], replay._sampler.pick
-    monkeypatch.setattr(replay._ahead, "ask", lambda _, *stretch: requested.append(stretch))
+    monkeypatch.setattr(replay._ahead, "request", lambda _, *range: requested.append(range))
     replay.sample(1, Every())
     assert not requested  # all images are in memory
     monkeypatch.setattr(ReadAhead, "is_wanted", True)
@@ -295,11 +293,10 @@ def test_read_ahead_requests_exactly_the_batch(tmp_path, monkeypatch, compress, 
     parts = [torch.cat([now, then], dim=1)] if n_step == 3 else [now, then]
     wanted = [(part.numpy(), *image) for part in parts for image in IMAGES.items()]
     for (slots, key, shape), (begin, end) in zip(wanted, requested, strict=True):
-        name, size = replay.keys[key], math.prod(shape)
+        size = math.prod(shape)
         at, count = slots * size, size
         if compress:
-            at, count = np.moveaxis(replay._data[f"{name}.span"][slots], -1, 0)
-            at = at % len(replay._compressed[name]._ring)
+            at, count = np.moveaxis(replay.arrays[span_name(key)][slots], -1, 0)
         contiguous = end > begin
         assert contiguous.mean() > 0.5
         assert compress or n_step == 6 or not contiguous.all()
@@ -310,7 +307,7 @@ def test_read_ahead_requests_exactly_the_batch(tmp_path, monkeypatch, compress, 
 
 def test_read_ahead_is_active_for_some_batches_after_page_faults(monkeypatch):
     faults = 0
-    monkeypatch.setattr(pictures, "_major_page_faults", lambda: faults)
+    monkeypatch.setattr(frames, "_major_page_faults", lambda: faults)
     ahead = ReadAhead()
 
     def batch(pages):
@@ -329,7 +326,7 @@ def test_read_ahead_is_active_for_some_batches_after_page_faults(monkeypatch):
 
 def test_read_ahead_reads_the_requested_pages_from_disk(tmp_path):
     pages = 300
-    with (tmp_path / "pictures").open("w+b") as file:
+    with (tmp_path / "frames").open("w+b") as file:
         file.write(bytes(pages * mmap.PAGESIZE))
         file.flush()
         os.fsync(file.fileno())
@@ -337,7 +334,7 @@ def test_read_ahead_reads_the_requested_pages_from_disk(tmp_path):
         with mmap.mmap(file.fileno(), 0) as mapped:
             begin = np.array([5000, 100, 100 * mmap.PAGESIZE + 7, 290 * mmap.PAGESIZE])
             end = np.array([9000, 50, 101 * mmap.PAGESIZE, pages * mmap.PAGESIZE])
-            ReadAhead.ask(mapped, begin, end)
+            ReadAhead.request(mapped, begin, end)
             wanted = {5000 // mmap.PAGESIZE, 9000 // mmap.PAGESIZE, 100, *range(290, pages)}
             wait_for(lambda: wanted <= in_memory(mapped))
 
@@ -355,9 +352,10 @@ def in_memory(mapped: mmap.mmap) -> set[int]:
 @pytest.mark.parametrize("count", [1, 3])
 def test_frame_transforms_are_applied_to_each_sample(compress, count):
     """A transform receives the sample's number in the batch, its stack, and its output array."""
-    rings = ReplayBuffer(config(capacity=90, compress=compress), OBSERVATIONS, ACTIONS, count=count)
+    settings = config(capacity=90, compress=compress)
+    rings = ReplayBuffer(spec_of(settings, rings=count))
     for number, ring in enumerate(rings.rings):
-        account = Account(ring.config)
+        account = Account(settings)
         for episode in range(4):
             for t in range(9):
                 write(ring, account, 10 * number + episode, t, Episode(8, "limit"))
@@ -399,7 +397,7 @@ def test_every_step_is_drawn_equally_often():
 
 def test_replay_holds_exactly_its_capacity():
     settings = config(capacity=1000)
-    replay, account = EpisodeRing(settings, OBSERVATIONS, ACTIONS), Account(settings)
+    replay, account = ReplayBuffer(spec_of(settings)), Account(settings)
     for episode in range(6):
         for t in range(251):
             write(replay, account, episode, t, Episode(250, "limit"))
@@ -486,7 +484,7 @@ def test_restored_episode_in_progress_continues(tmp_path):
 
 def restore_anywhere(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
     """Save at some step, write, restore, write again: the contents are always correct."""
-    replay, account = EpisodeRing(settings, OBSERVATIONS, ACTIONS), Account(settings)
+    replay, account = ReplayBuffer(spec_of(settings)), Account(settings)
     state, saved = replay.state_dict(), 0
     for episode, plan in enumerate(episodes):
         for t in range(plan.length + 1):
@@ -516,7 +514,7 @@ def test_restoring_at_any_time_long(config, episodes, data):
 def restore_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.DataObject) -> None:
     """Save, write, die at any time, restore: the replay holds the same steps as at the save."""
     with tempfile.TemporaryDirectory() as folder:
-        replay = EpisodeRing(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
+        replay = ReplayBuffer(spec_of(settings), Path(folder))
         account = Account(settings)
         state, saved, lost = replay.state_dict(), 0, 0
         for episode, plan in enumerate(episodes):
@@ -527,9 +525,9 @@ def restore_exactly(settings: ReplayConfig, episodes: list[Episode], data: st.Da
                 replay.flush()
                 state, saved, lost = replay.state_dict(), len(account.timesteps), account.lost
             if move == "save":
-                replay.settle()
+                replay.confirm_checkpoint()
             elif move.endswith("die"):
-                replay = EpisodeRing(settings, OBSERVATIONS, ACTIONS, directory=Path(folder))
+                replay = ReplayBuffer(spec_of(settings), Path(folder))
                 replay.load_state_dict(state)
                 del account.timesteps[saved:]
                 account.lost = lost
@@ -564,7 +562,7 @@ def test_full_disk_stops_the_journal_but_not_the_replay(tmp_path, caplog):
     run.play(9, 9)
     run.replay.flush()
     state, timesteps = run.replay.state_dict(), len(run.account.timesteps)
-    run.replay.settle()
+    run.replay.confirm_checkpoint()
     run.replay._journal._file = Full(run.replay._journal._file)
     run.play(9, 2)
     assert caplog.text.count("the disk is full") == 1
@@ -591,7 +589,7 @@ def test_half_written_timestep_is_ignored(tmp_path):
 
     run = Run(tmp_path / "replay")
     run.play(30, ending="cut")  # so that the next timestep overwrites an older one
-    run.replay._data["reward"] = Dies()
+    run.replay.rings[0]._data["reward"] = Dies()
     with pytest.raises(KeyboardInterrupt):
         run.replay.add(Transition(act(0, 30), 0.0, 1.0, observe(0, 31), last=False))
     run.account.lost += 1
@@ -613,7 +611,7 @@ def test_overwritten_state_without_journal_keeps_the_newer_steps(tmp_path, monke
     run = Run(tmp_path / "replay")
     run.play(5)
     state = run.replay.state_dict()
-    run.replay.settle()
+    run.replay.confirm_checkpoint()
     monkeypatch.setattr("merl.replay.journal.Journal.keep", lambda *_, **__: None)
     run.play(20, 20)
     for ring in (run.replay, make(run.directory)):
@@ -628,20 +626,21 @@ def test_ring_grows_if_opened_with_a_larger_capacity(tmp_path):
     run.play(5, 4, 6)
     run.values["capacity"] = 50
     run.account.config = config(capacity=50)
+    state = run.replay.state_dict()
     run.replay = make(run.directory, capacity=50)
-    assert run.replay.capacity == 50
+    run.replay.load_state_dict(state)
     run.play(9, 9, 9, 9, 9)
     check(run.replay, run.account)
 
 
 def lengthen(run: Run, capacity: int) -> None:
-    """Open the replay of a run again, with a larger capacity."""
-    before, held = run.replay.ring_index.length, run.account.held()
+    """Open and restore the replay of a run with a larger capacity."""
+    held, state = run.account.held(), run.replay.state_dict()
     run.values["capacity"] = capacity
     run.account.config = config(**run.values)
     run.replay = make(run.directory, **run.values)
-    run.account.length, nominal = run.replay.ring_index.length, Account(run.account.config).slots
-    assert nominal <= run.account.length <= max(nominal, 1.5 * before)
+    run.replay.load_state_dict(state)
+    assert run.replay.slots == run.account.slots
     assert run.account.held()[-len(held) :] == held
 
 
@@ -675,43 +674,41 @@ def test_grown_ring_restores_its_last_checkpoint(tmp_path, compress):
             len(run.account.timesteps),
             run.account.lost,
         )
-        run.replay.settle()
+        run.replay.confirm_checkpoint()
         run.play(*[2] * more)  # overwrites older timesteps; then the process dies
         run.values["capacity"] = 50
         run.account.config = config(**run.values)
         run.restore(state, timesteps)
-        run.account.length, run.account.lost = run.replay.ring_index.length, lost
+        run.account.lost = lost
         check(run.replay, run.account)
         run.play(*[9] * 8)
         check(run.replay, run.account)
 
 
 @pytest.mark.parametrize("killed", [False, True])
-@pytest.mark.parametrize("at", [0, 1, 5])
-def test_failed_growth_keeps_the_old_contents(tmp_path, monkeypatch, at, killed):
+@pytest.mark.parametrize("function", ["posix_fallocate", "fsync", "rename"])
+def test_failed_growth_keeps_the_old_contents(tmp_path, monkeypatch, function, killed):
     """Growth stops at several points, by an exception or by a kill without any cleanup."""
     run = Run(tmp_path)
     run.play(9, 9, 4)
-    moved = 0
+    state = run.replay.state_dict()
+    larger = make(tmp_path, capacity=70)
 
-    class Dying(mmap.mmap):
-        def move(self, to: int, begin: int, count: int) -> None:
-            nonlocal moved
-            moved += 1
-            if moved > at:
-                raise KeyboardInterrupt
-            super().move(to, begin, count)
+    def stop(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(storage.mmap, "mmap", Dying)
+    monkeypatch.setattr(os, function, stop)
     if killed:
-        monkeypatch.setattr(storage, "_undo", lambda *_: None)
+        monkeypatch.setattr("shutil.rmtree", lambda *_, **__: None)
     with pytest.raises(KeyboardInterrupt):
-        make(tmp_path, capacity=70)
+        larger.load_state_dict(state)
     monkeypatch.undo()
+    assert (tmp_path / "part").exists() == killed
     run.replay = make(tmp_path)
     check(run.replay, run.account)
     lengthen(run, 70)
     check(run.replay, run.account)
+    assert not (tmp_path / "part").exists()
 
 
 def test_smaller_capacity_samples_only_the_newest_steps(tmp_path):
@@ -729,7 +726,7 @@ def test_smaller_capacity_samples_only_the_newest_steps(tmp_path):
 
 
 def files(directory: Path) -> list[Path]:
-    return sorted(directory.glob("*.bin"))
+    return sorted(directory.rglob("*.bin"))
 
 
 def test_step_takes_at_most_21_6_kilobytes(tmp_path):
@@ -741,7 +738,8 @@ def test_step_takes_at_most_21_6_kilobytes(tmp_path):
     )
     actions = gymnasium.spaces.Box(-1, 1, (9,), np.float32)
     settings = ReplayConfig(capacity=1000)
-    replay = EpisodeRing(settings, observations, actions, directory=tmp_path)
+    spec = ReplaySpec.of(settings, observations, actions)
+    replay = ReplayBuffer(spec, tmp_path)
     seen = observations.sample()
     for t in range(1000):
         if t % 250 == 0:
@@ -749,20 +747,20 @@ def test_step_takes_at_most_21_6_kilobytes(tmp_path):
         replay.add(Transition(actions.sample(), 0.0, 1.0, seen, last=t % 250 == 249))
     assert len(replay) == 1000
     on_disk = sum(file.stat().st_size for file in files(tmp_path))
-    assert on_disk == replay_bytes(settings, observations, actions)
-    in_memory = replay.sources.nbytes
-    million = replay_bytes(settings, observations, actions, 1_000_000) + 1000 * in_memory
+    assert on_disk == spec.bytes
+    in_memory = replay.rings[0].sources.nbytes
+    million = replace(spec, capacity=1_000_000).bytes + 1000 * in_memory
     assert million <= 21_600 * 1_000_000
 
 
 def test_files_have_the_documented_layout(tmp_path):
     run = Run(tmp_path)
     run.play(3)
-    header = json.loads((tmp_path / "replay.json").read_text())
-    assert header["slots"] == 23
+    header = json.loads((tmp_path / "23/replay.json").read_text())
+    assert header["rings"] == 1
     assert header["fields"]["observation.wrist%2Fleft"] == {"dtype": "|u1", "shape": [2, 2, 1]}
     assert {file.stem for file in files(tmp_path)} == set(header["fields"])
-    frames = np.fromfile(tmp_path / "observation.front.bin", np.uint8).reshape(23, 3, 4, 3)
+    frames = np.fromfile(tmp_path / "23/observation.front.bin", np.uint8).reshape(23, 3, 4, 3)
     for t in range(4):
         np.testing.assert_array_equal(frames[t], observe(0, t)["front"])
 
@@ -818,26 +816,28 @@ def test_file_size_limit_leaves_no_files(tmp_path):
 def test_growing_on_a_full_disk_changes_nothing(tmp_path, monkeypatch):
     run = Run(tmp_path)
     run.play(5, 4)
-    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    state = run.replay.state_dict()
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*.*")}
     reserve = os.posix_fallocate
 
     def full(file: int, start: int, size: int) -> None:
         reserve(file, start, size)
-        if start == 23 * 8:  # the last field, timestep
+        if size == 505 * 8:  # the last field, timestep
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(MerlError, match="No space left"):
-        make(tmp_path, capacity=500)
-    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
+        make(tmp_path, capacity=500).load_state_dict(state)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*.*")} == before
     run.replay = make(tmp_path)
     check(run.replay, run.account)
 
 
-def test_files_without_header_are_replaced(tmp_path):
+def test_incomplete_files_are_replaced(tmp_path):
     Run(tmp_path).play(5)
-    (tmp_path / "replay.json").unlink()
+    (tmp_path / "23").rename(tmp_path / "part")
     run = Run(tmp_path)
+    assert not (tmp_path / "part").exists()
     assert len(run.replay) == 0
     run.play(5)
     check(run.replay, run.account)
@@ -847,20 +847,20 @@ def test_files_without_header_are_replaced(tmp_path):
     ("function", "message"), [("available_memory", "of memory"), ("free_disk", "of disk")]
 )
 def test_error_names_the_largest_capacity_that_fits(tmp_path, monkeypatch, function, message):
-    settings = ReplayConfig()
+    spec = spec_of(ReplayConfig())
     room = 30_000_000
-    monkeypatch.setattr(f"merl.replay.config.{function}", lambda *_: room)
+    monkeypatch.setattr(f"merl.replay.capacity.{function}", lambda *_: room)
     directory = tmp_path / "run" / "replay"
     with pytest.raises(MerlError, match=message) as caught:
-        EpisodeRing(settings, OBSERVATIONS, ACTIONS, directory=directory)
+        ReplayBuffer(spec, directory)
     assert "1,000,000 steps" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
     words = str(caught.value).split()
     largest = int(words[words.index("--replay.capacity") + 1])
-    assert replay_bytes(settings, OBSERVATIONS, ACTIONS, largest) <= room
-    assert replay_bytes(settings, OBSERVATIONS, ACTIONS, largest + 1) > room
-    check_fits(settings, OBSERVATIONS, ACTIONS, directory=directory, capacity=largest)
+    assert replace(spec, capacity=largest).bytes <= room
+    assert replace(spec, capacity=largest + 1).bytes > room
+    check_fits(replace(spec, capacity=largest), directory)
 
 
 @pytest.mark.parametrize("count", [1, 3, 7])
@@ -868,49 +868,51 @@ def test_error_names_the_largest_capacity_that_fits(tmp_path, monkeypatch, funct
 @pytest.mark.parametrize("capacity", [20, 100])
 def test_several_rings_take_the_computed_bytes(tmp_path, count, compress, capacity):
     settings = config(capacity=capacity, batch_size=20, compress=compress)
-    ReplayBuffer(settings, OBSERVATIONS, ACTIONS, count=count, directory=tmp_path)
-    taken = sum(file.stat().st_size for file in tmp_path.rglob("*.bin"))
-    assert taken == replay_bytes(settings, OBSERVATIONS, ACTIONS, rings=count)
+    spec = spec_of(settings, rings=count)
+    ReplayBuffer(spec, tmp_path)
+    assert sum(file.stat().st_size for file in files(tmp_path)) == spec.bytes
 
 
 def test_rings_that_do_not_fit_together_are_rejected(tmp_path, monkeypatch):
-    settings = config(capacity=100)
-    both = replay_bytes(settings, OBSERVATIONS, ACTIONS, rings=2)
-    monkeypatch.setattr("merl.replay.config.available_memory", lambda: both - 1)
+    spec = spec_of(config(capacity=100), rings=2)
+    monkeypatch.setattr("merl.replay.capacity.available_memory", lambda: spec.bytes - 1)
     with pytest.raises(MerlError, match=r"100 steps .* --replay\.capacity"):
-        ReplayBuffer(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
+        ReplayBuffer(spec, tmp_path / "ring")
     assert list(tmp_path.iterdir()) == []
-    monkeypatch.setattr("merl.replay.config.available_memory", lambda: both)
-    ReplayBuffer(settings, OBSERVATIONS, ACTIONS, count=2, directory=tmp_path / "ring")
+    monkeypatch.setattr("merl.replay.capacity.available_memory", lambda: spec.bytes)
+    ReplayBuffer(spec, tmp_path / "ring")
 
 
 def test_error_suggests_compression_if_it_fits(monkeypatch):
     camera = gymnasium.spaces.Box(0, 255, (84, 84, 3), np.uint8)
     spaces = gymnasium.spaces.Dict({"camera": camera})
-    monkeypatch.setattr("merl.replay.config.available_memory", lambda: 8_000_000_000)
+    raw, compressed = (
+        ReplaySpec.of(ReplayConfig(compress=compress), spaces, ACTIONS)
+        for compress in (False, True)
+    )
+    monkeypatch.setattr("merl.replay.capacity.available_memory", lambda: 8_000_000_000)
     with pytest.raises(MerlError) as caught:
-        check_fits(ReplayConfig(), spaces, ACTIONS)
+        check_fits(raw)
     words = str(caught.value).split()
-    small = replay_bytes(ReplayConfig(compress=True), spaces, ACTIONS)
-    assert words[words.index("--replay.compress") + 4] == f"{small / 1e9:.3g}"
+    assert words[words.index("--replay.compress") + 4] == f"{compressed.bytes / 1e9:.3g}"
     assert "--replay.capacity" in words
-    check_fits(ReplayConfig(compress=True), spaces, ACTIONS)
-    monkeypatch.setattr("merl.replay.config.available_memory", lambda: 5_000_000_000)
+    check_fits(compressed)
+    monkeypatch.setattr("merl.replay.capacity.available_memory", lambda: 5_000_000_000)
     with pytest.raises(MerlError, match=r"available: --replay\.capacity"):
-        check_fits(ReplayConfig(), spaces, ACTIONS)
+        check_fits(raw)
 
 
 def test_disk_space_is_ignored_without_a_directory(monkeypatch):
-    monkeypatch.setattr("merl.replay.config.free_disk", lambda *_: 0)
+    monkeypatch.setattr("merl.replay.capacity.free_disk", lambda *_: 0)
     make()
-    monkeypatch.setattr("merl.replay.config.available_memory", lambda: 10)
+    monkeypatch.setattr("merl.replay.capacity.available_memory", lambda: 10)
     with pytest.raises(MerlError, match="free some"):
         make()
 
 
 def test_existing_replay_opens_on_a_disk_that_it_fills(tmp_path, monkeypatch):
     make(tmp_path)
-    monkeypatch.setattr("merl.replay.config.free_disk", lambda *_: 0)
+    monkeypatch.setattr("merl.replay.capacity.free_disk", lambda *_: 0)
     make(tmp_path)
     with pytest.raises(MerlError, match="of disk"):
         make(tmp_path, capacity=25)
@@ -953,7 +955,7 @@ def test_batch_larger_than_the_replay_is_rejected():
 )
 def test_space_that_is_neither_image_nor_vector_is_rejected(space):
     with pytest.raises(MerlError, match="observation 'depth'"):
-        EpisodeRing(config(), gymnasium.spaces.Dict({"depth": space}), ACTIONS)
+        ReplaySpec.of(config(), gymnasium.spaces.Dict({"depth": space}), ACTIONS)
 
 
 @pytest.mark.parametrize(
@@ -1023,18 +1025,18 @@ def test_directory_with_another_replay_is_rejected(tmp_path):
     make(tmp_path)
     other = gymnasium.spaces.Dict({"joints": OBSERVATIONS["joints"]})
     with pytest.raises(MerlError, match="other observations"):
-        EpisodeRing(config(), other, ACTIONS, directory=tmp_path)
+        ReplayBuffer(ReplaySpec.of(config(), other, ACTIONS), tmp_path)
 
 
 def test_damaged_directory_is_rejected(tmp_path):
     make(tmp_path)
-    os.truncate(tmp_path / "observation.front.bin", 100)
+    os.truncate(tmp_path / "23/observation.front.bin", 100)
     with pytest.raises(MerlError, match="truncated"):
         make(tmp_path)
-    (tmp_path / "observation.front.bin").unlink()
+    (tmp_path / "23/observation.front.bin").unlink()
     with pytest.raises(MerlError, match="damaged"):
         make(tmp_path)
-    (tmp_path / "replay.json").write_text("{")
+    (tmp_path / "23/replay.json").write_text("{")
     with pytest.raises(MerlError, match="damaged"):
         make(tmp_path)
 
@@ -1044,3 +1046,84 @@ def test_file_in_place_of_the_directory_is_rejected(tmp_path):
     with pytest.raises(MerlError, match="cannot store a replay in"):
         make(tmp_path / "run" / "replay")
     assert (tmp_path / "run").read_text() == "a file"
+
+
+# Other types of frames
+
+FRAMES = ReplaySpec(
+    config(),
+    {
+        "depth": KeySpec(np.dtype("<u2"), (4, 5), stacked=True, compressible=True),
+        "heat": KeySpec(np.dtype("<f4"), (2, 3), stacked=True),
+        "label": KeySpec(np.dtype("u1"), (3, 4, 1)),
+        "touch": KeySpec(np.dtype("<f4"), (6, 2)),
+    },
+    ACTIONS.shape,
+    capacity=40,
+    rings=2,
+)
+
+
+def typed(ring: int, t: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng((ring, t))
+    return {
+        "depth": rng.integers(0, 65536, (4, 5)).astype(np.uint16),
+        "heat": rng.standard_normal((2, 3), np.float32),
+        "label": rng.integers(0, 256, (3, 4, 1)).astype(np.uint8),
+        "touch": rng.standard_normal((6, 2), np.float32),
+    }
+
+
+@pytest.mark.parametrize("storage", ["raw", "compressed", "device"])
+def test_frames_of_any_type_are_stored_and_stacked_exactly(tmp_path, storage):
+    spec = replace(FRAMES, config=config(compress=storage == "compressed"))
+    replay = ReplayBuffer(spec, tmp_path)
+    assert spec.compressed == (("depth",) if storage == "compressed" else ())
+    for t in range(45):  # both rings wrap
+        for ring in range(2):
+            if t == 0:
+                replay.begin(typed(ring, 0), ring)
+            else:
+                replay.add(Transition(act(ring, t - 1), 0.0, 1.0, typed(ring, t), False), ring)
+    if storage == "device":
+        copy = DeviceReplay(replay, torch.device("cpu"))
+        copy.follow()
+        batch = copy.sample(64, torch.Generator().manual_seed(0))
+    else:
+        batch = replay.sample(64, np.random.default_rng(0))
+    for number, (ring, t) in enumerate(batch.action.int().tolist()):
+        for key, stored in spec.keys.items():
+            for values, newest in (
+                (batch.observation[key], t),
+                (batch.next_observation[key], min(t + 3, 44)),
+            ):
+                expected = [typed(ring, newest - back)[key] for back in (2, 1, 0)]
+                value = values[number].numpy()
+                assert value.dtype == stored.dtype
+                np.testing.assert_array_equal(value, expected if stored.stacked else expected[-1])
+
+
+def test_frames_of_any_type_are_restored_after_growth(tmp_path):
+    spec = replace(FRAMES, config=config(compress=True), rings=1)
+    replay = ReplayBuffer(spec, tmp_path)
+    replay.begin(typed(0, 0))
+    for t in range(1, 70):
+        replay.add(Transition(act(0, t - 1), 0.0, 1.0, typed(0, t), False))
+    before = replay.sample(len(replay), Every())
+    larger = ReplayBuffer(replace(spec, capacity=90), tmp_path)
+    larger.load_state_dict(replay.state_dict())
+    after = larger.sample(len(larger), Every())
+    for key in spec.keys:
+        held = after.observation[key][-len(before.action) :].numpy()
+        np.testing.assert_array_equal(held, before.observation[key].numpy())
+
+
+def test_float_frames_cannot_be_compressed():
+    with pytest.raises(ValueError, match="cannot be compressed"):
+        KeySpec(np.dtype("<f4"), (2, 3), stacked=True, compressible=True)
+
+
+def test_value_of_another_integer_type_is_rejected():
+    replay = ReplayBuffer(replace(FRAMES, rings=1))
+    with pytest.raises(MerlError, match=r"depth is int32 \(4, 5\), but its space says uint16"):
+        replay.begin(typed(0, 0) | {"depth": np.zeros((4, 5), np.int32)})

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from merl.core import MerlError
-from merl.report.curves import Curve, aggregate, curve, read_metrics
+from merl.report.curves import Curve, aggregate, curve_of, read_metrics
 
 METRICS = "step,train/return,eval/return,time/seconds\n10,1.5,,60\n20,,7,120\n30,nan,9.25,240\n"
 
@@ -44,7 +44,7 @@ def test_an_incomplete_last_line_is_skipped(run, incomplete):
 def test_a_run_without_rows_has_an_empty_curve(run, text):
     (run / "metrics.csv").write_text(text)
     assert len(read_metrics(run)["step"]) == 0
-    assert len(curve(run, "eval/return").steps) == 0
+    assert len(curve_of(read_metrics(run), "eval/return").steps) == 0
 
 
 @pytest.mark.parametrize("text", [METRICS + "40,1\n", METRICS + "40,a,2,3\n", "frame,x\n1,2\n"])
@@ -60,14 +60,15 @@ def test_a_missing_file_is_reported(tmp_path):
 
 
 def test_a_curve_skips_empty_cells(run):
-    steps, values = curve(run, "eval/return")
+    steps, values = curve_of(read_metrics(run), "eval/return")
     np.testing.assert_array_equal(steps, [20, 30])
     np.testing.assert_array_equal(values, [7, 9.25])
-    assert len(curve(run, "eval/unknown").steps) == 0
+    assert len(curve_of(read_metrics(run), "eval/unknown").steps) == 0
 
 
 def test_a_curve_over_another_column(run):
-    np.testing.assert_array_equal(curve(run, "eval/return", "time/seconds").steps, [120, 240])
+    over_time = curve_of(read_metrics(run), "eval/return", "time/seconds")
+    np.testing.assert_array_equal(over_time.steps, [120, 240])
 
 
 def test_aggregate_of_seeds_on_the_same_steps():
@@ -83,12 +84,6 @@ def test_aggregate_interpolates_and_never_extrapolates():
     together = aggregate([line([0, 10, 20], [0, 10, 20]), line([5, 15], [1, 3])])
     np.testing.assert_array_equal(together.steps, [5, 10, 15])
     np.testing.assert_array_equal(together.values, [[5, 10, 15], [1, 2, 3]])
-
-
-def test_aggregate_on_a_given_grid():
-    together = aggregate([line([0, 10], [0, 10])], grid=np.array([-1.0, 4.0, 11.0]))
-    np.testing.assert_array_equal(together.steps, [4])
-    np.testing.assert_array_equal(together.mean, [4])
 
 
 def test_aggregate_with_a_bootstrap_band():

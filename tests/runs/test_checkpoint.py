@@ -24,6 +24,7 @@ CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")
 def agent(seed: int = 0, config: AgentConfig = CONFIG) -> DDPG:
     env = DotEnv()
     return make_agent(
+        "sac" if isinstance(config, SACConfig) else "merl",
         config,
         env.observation_space,
         env.action_space,
@@ -54,14 +55,14 @@ def weights(agent: DDPG) -> torch.Tensor:
         replace(CONFIG, fusion="shared"),
         replace(CONFIG, fusion="shared_by_both", target="heads_and_fusion"),
         replace(CONFIG, latent_dim=0),
-        SACConfig(images=None, vectors=None, hidden_dim=16, precision="bf16"),
+        SACConfig(keys=None, hidden_dim=16, precision="bf16"),
     ],
     ids=lambda config: f"{type(config).__name__}-{config.fusion}-{config.latent_dim}",
 )
 def test_save_and_load_restores_the_agent(tmp_path: Path, config: AgentConfig) -> None:
     saved, other = agent(0, config), agent(1, config)
     for one in (saved, other):
-        one.update(make_batch())
+        one.update(make_batch(), step=0)
     save(tmp_path, 250, saved, {"a": 1}, score=2.5, keep=2)
     found = Checkpoint.find(tmp_path)
     load_agent(other, found)
@@ -69,7 +70,7 @@ def test_save_and_load_restores_the_agent(tmp_path: Path, config: AgentConfig) -
     assert torch.equal(weights(saved), weights(other))
     assert torch.equal(saved.learning.get_state(), other.learning.get_state())
     for one in (saved, other):
-        one.update(make_batch())
+        one.update(make_batch(), step=0)
     assert torch.equal(weights(saved), weights(other))
 
 
@@ -144,7 +145,7 @@ def test_a_checkpoint_of_another_device_loads(tmp_path: Path) -> None:
 def test_a_checkpoint_written_on_cuda_resumes_on_the_cpu(tmp_path: Path) -> None:
     """The file claims that its tensors are on cuda:0 and that its Adam is for CUDA graphs."""
     saved, other = agent(0), agent(1)
-    saved.update(make_batch())
+    saved.update(make_batch(), step=0)
     for optimizer in (saved.critic_optimizer, saved.actor_optimizer):
         optimizer.param_groups[0]["capturable"] = True
     save(tmp_path, 1, saved, {}, score=None, keep=1)
@@ -162,7 +163,7 @@ def test_a_checkpoint_written_on_cuda_resumes_on_the_cpu(tmp_path: Path) -> None
         optimizer.param_groups[0]["capturable"] = False
     for learner in (saved, other):
         learner.learning.manual_seed(0)
-        learner.update(make_batch())
+        learner.update(make_batch(), step=0)
     assert torch.equal(weights(saved), weights(other))
 
 

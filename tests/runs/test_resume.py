@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from merl.core import MerlError
+from merl.envs.config import EnvConfig
 from merl.experiments.presets import compose
 from merl.runs.resume import merge_resume_config
 
@@ -63,3 +64,10 @@ def test_resume_refuses_other_changes_and_names_them(asked, named) -> None:  # t
     for words in named:
         assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_users_environment_resumes_with_any_env_config_of_merls_own_tasks() -> None:
+    asked = compose("smoke", "Pendulum-v1", "ddpg")
+    recorded = dataclasses.replace(asked, env=EnvConfig(image_size=48, renderer="gl"))
+    assert asked.env != recorded.env
+    assert merge_resume_config(recorded, asked) == (recorded, [])

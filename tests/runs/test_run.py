@@ -30,7 +30,7 @@ PENDULUM += "--eval.video none --eval.no-references --run-dir"
 @pytest.fixture
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("commit", "machine", "package_versions"):
-        monkeypatch.setattr(f"merl.runs.run.{name}", dict)
+        monkeypatch.setattr(f"merl.runs.record.{name}", dict)
 
 
 def together(*actions: Any) -> list[BaseException | None]:
@@ -120,14 +120,14 @@ def test_discard_keeps_other_files_and_an_existing_folder(tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("_quick")
-@pytest.mark.parametrize("name", ["commit", "trust.remember"])
+@pytest.mark.parametrize("name", ["record.commit", "trust.remember"])
 def test_an_interrupted_start_leaves_no_files(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"merl.runs.run.{name}", interrupt)
+    monkeypatch.setattr(f"merl.runs.{name}", interrupt)
     config = dataclasses.replace(CONFIG, run_dir=tmp_path / "run")
     with pytest.raises(KeyboardInterrupt), Run.begin(config, *SPACES):
         pass

@@ -18,7 +18,8 @@ from gymnasium import spaces
 import merl
 from merl.cli import main
 from merl.core import MerlError
-from merl.envs.user_env import imports_code, load_module, module_folder
+from merl.core.user_code import module_folder
+from merl.envs.user_env import imports_code, load_module
 from merl.runs import trust
 from merl.runs.run import Run
 from merl.runs.trust import Origin
@@ -48,6 +49,7 @@ class Arm(gymnasium.Env):
 def make():
     return Arm()
 """
+TASK = "toy_arm:make"
 _FLAGS = {
     "--agent": "ddpg",
     "--preset": "smoke",
@@ -111,7 +113,7 @@ def edit(run: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def set_task(run: Path, task: str) -> None:
-    edit(run, lambda record: record.update(task=task, module_folder=str(run)))
+    edit(run, lambda record: record.update(task=task, module_folders={task: str(run)}))
     edit(run, lambda record: record["config"].update(task=task))
 
 
@@ -154,7 +156,7 @@ def test_a_run_trained_here_imports_its_recorded_module(
     untrusted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The folder in its config and the working folder are not trusted."""
-    edit(untrusted, lambda record: record.update(module_folder=str(untrusted)))
+    edit(untrusted, lambda record: record.update(module_folders={TASK: str(untrusted)}))
     monkeypatch.chdir(untrusted)
     for command, *more in COMMANDS:
         assert main([command, ".", *more]) == 0
@@ -185,7 +187,7 @@ def test_the_trust_flag_is_reported_and_recorded_on_resume(
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of another user"))
     monkeypatch.chdir(tmp_path)
-    edit(untrusted, lambda record: record.update(module_folder=str(untrusted)))
+    edit(untrusted, lambda record: record.update(module_folders={TASK: str(untrusted)}))
     run = str(untrusted)
     assert main(["evaluate", run, "--episodes", "1"]) == 2
     capsys.readouterr()
@@ -204,7 +206,7 @@ def test_train_with_resume_trusts_the_module_of_the_command(
 ) -> None:
     """`train --resume` imports the named module from the working folder of the user."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of another user"))
-    edit(untrusted, lambda record: record.update(module_folder=str(untrusted)))
+    edit(untrusted, lambda record: record.update(module_folders={TASK: str(untrusted)}))
     monkeypatch.chdir(trained.parent)
     line = ["train", "toy_arm:make", *SMALL, "--run-dir", str(untrusted), "--resume"]
     assert main(line) == 0
@@ -229,8 +231,10 @@ def test_a_module_is_loaded_from_its_folder_and_replaces_no_other(tmp_path: Path
 def test_nothing_is_trusted_if_no_record_can_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    identity, origin = trust.identity(), Origin("evil:make", None)
-    record = {"id": identity, "config": {"task": "evil:make"}, "module_folder": None}
+    identity = trust.identity()
+    config = {"task": "evil:make", "agent_name": "merl", "agent": {}}
+    record = {"id": identity, "config": config, "module_folders": {}}
+    origin = Origin({"environment": "evil:make", "agent": "merl"}, {})
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     trust.remember(record)
@@ -284,3 +288,74 @@ def test_the_working_folder_is_not_searched(tmp_path: Path) -> None:
 def test_spaces_are_read_without_running_code(trained: Path) -> None:
     observation, _ = Run.open(trained).spaces()
     assert observation["state"] == spaces.Box(-1, 1, (2,))
+
+
+ENCODER = """
+from torch import nn
+
+
+class Wrist(nn.Linear):
+    features = 3
+
+    def __init__(self, modality, stack):
+        super().__init__(modality.shape[0], 3)
+"""
+
+
+@pytest.fixture
+def encoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Train a run with an encoder of the working folder; return the command."""
+    (tmp_path / "wrist.py").write_text(ENCODER)
+    monkeypatch.chdir(tmp_path)
+    command = ["train", "merl.envs.dot:whole", *SMALL, "--agent", "proprio", "--run-dir", "run"]
+    command += ["--agent.encoders.joints", "wrist:Wrist"]
+    assert main(command) == 0
+    del sys.modules["wrist"]
+    yield command
+    sys.modules.pop("wrist", None)
+
+
+def test_a_run_trained_here_imports_its_encoder(
+    encoded: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert encoded
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert main(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 0
+    del sys.modules["wrist"]
+    assert main(["resume", str(tmp_path / "run"), "--steps", "40"]) == 0
+    assert sys.modules["wrist"].__file__ == str(tmp_path / "wrist.py")
+
+
+def test_the_encoder_of_an_untrusted_run_is_not_imported(
+    encoded: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    mark = tmp_path / "imported"
+    (tmp_path / "wrist.py").write_text(f"open({str(mark)!r}, 'w')\n{ENCODER}")
+    run = tmp_path / "run"
+
+    def refused(*command: str) -> str:
+        assert main(list(command)) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert not mark.exists()
+        return error
+
+    edit(run, lambda record: record["config"]["agent"]["encoders"].update(joints="http.server:A"))
+    assert "its config.json was changed since then" in refused("evaluate", str(run))
+    edit(run, lambda record: record["config"]["agent"]["encoders"].update(joints="wrist:Wrist"))
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of another user"))
+    named = "names code as its encoder of 'joints': 'Wrist' of module 'wrist', in folder"
+    for command, *more in COMMANDS:
+        assert named in refused(command, str(run), *more)
+    with pytest.raises(MerlError, match=r"add --trust \(in Python: trust=True\)"):
+        merl.load_policy(run)
+    assert "cannot resume with agent.encoders" in refused(*encoded[:-1], "identity", "--resume")
+    assert main(["evaluate", str(run), "--episodes", "1", "--trust"]) == 0
+    assert "--trust: importing 'Wrist' of module 'wrist'" in capsys.readouterr().err
+    assert mark.exists()
+    assert main([*encoded, "--resume", "--steps", "40"]) == 0  # names the encoder in its folder

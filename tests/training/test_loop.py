@@ -8,16 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 
+from merl.accelerate.device_replay import DeviceReplay
+from merl.accelerate.recording import UpdateFromHost, UpdateOnDevice
 from merl.acting.environments import InProcessEnvs
 from merl.acting.rollout import Episode, Fetched, FrameStack, mean_metrics
 from merl.agents import make_agent
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.config import TrainConfig
-from merl.replay import ReplayBuffer, ReplayConfig
-from merl.replay.on_device import OnDevice
+from merl.core import UpdatePlan
+from merl.modalities import Image, modalities_of
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.training import loop
 from merl.training.loop import (
     Collector,
@@ -28,7 +32,7 @@ from merl.training.loop import (
     train,
     updates_due,
 )
-from merl.training.updating import UpdateFromHost, UpdateOnDevice, update_from_host
+from merl.training.updating import plain_update, update_on_cpu
 from toy import DotEnv
 
 CPU = torch.device("cpu")
@@ -51,13 +55,22 @@ class SmallRun:
         self.randomness = Randomness(config.seed)
         space, actions = self.env.observation_space, self.env.action_space
         self.agent: DDPG = make_agent(
-            config.agent, space, actions, frame_stack=3, seed=self.randomness.agent, device=CPU
+            "merl",
+            config.agent,
+            space,
+            actions,
+            frame_stack=3,
+            seed=self.randomness.agent,
+            device=CPU,
         )
-        self.replay = ReplayBuffer(config.replay, space, actions, capacity=config.steps)
+        spec = ReplaySpec.of(config.replay, space, actions, capacity=config.steps)
+        self.replay = ReplayBuffer(spec)
         self.progress = Progress()
-        self.update: Update = update_from_host(self.agent, self.replay, self.randomness, config)
+        self.update: Update = update_on_cpu(self.agent, self.replay, self.randomness, config)
         self.collector = Collector(
-            InProcessEnvs(self.env), self.replay, [FrameStack(3, ("image",), CPU)]
+            InProcessEnvs(self.env),
+            self.replay,
+            [FrameStack(modalities_of(self.env.observation_space), 3, CPU)],
         )
 
     def results(self) -> Iterator[StepResult]:
@@ -84,10 +97,10 @@ def stopped_after(number: int, run: SmallRun) -> StepResult:
     """Return the last result if a signal arrives during update `number`, counted from 0."""
     stop, update = False, run.update
 
-    def update_with_signal() -> dict[str, torch.Tensor]:
+    def update_with_signal(step: int) -> dict[str, torch.Tensor]:
         nonlocal stop
         stop = stop or run.progress.updates == number
-        return update()
+        return update(step)
 
     arguments = (
         run.collector,
@@ -183,27 +196,30 @@ def test_updates_due_is_exact_for_decimal_ratios() -> None:
     assert updates_due(-5, 0.5) <= 0
 
 
-def test_the_loop_sets_the_step_of_the_agent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_agent_receives_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """The noise depends on the step, in acting and in learning."""
     agent = dataclasses.replace(CONFIG.agent, noise_std=1.0, noise_std_end=0.0, noise_steps=60)
     run = SmallRun(dataclasses.replace(CONFIG, agent=agent, action_repeat=2))
-    act, learn = run.agent.act, run.agent.learn
+    act, plan = run.agent.act, run.agent.plan
     steps: list[int] = []
+    deviations: list[float] = []
 
-    def recorded_act(*args: Any, **options: Any) -> torch.Tensor:
-        steps.append(run.agent.step)
-        return act(*args, **options)
+    def recorded_act(observation: Any, *, explore: bool, step: int) -> torch.Tensor:
+        steps.append(step)
+        return act(observation, explore=explore, step=step)
 
-    def recorded_learn(*args: Any) -> dict[str, torch.Tensor]:
-        steps.append(run.agent.step)
-        return learn(*args)
+    def recorded_plan(step: int) -> UpdatePlan:
+        steps.append(step)
+        planned = plan(step)
+        deviations.append(planned.noise_std)
+        return planned
 
     monkeypatch.setattr(run.agent, "act", recorded_act)
-    monkeypatch.setattr(run.agent, "learn", recorded_learn)
+    monkeypatch.setattr(run.agent, "plan", recorded_plan)
     run.finish()
     assert steps[:4] == [10, 12, 14, 16]  # one step of the loop is two environment steps
     assert max(steps) == 58
-    assert run.agent.config.noise(run.agent.step) == pytest.approx(1 - 58 / 60)
+    assert deviations[-1] == pytest.approx(1 - 58 / 60)
 
 
 def test_the_loop_yields_every_step_and_reports_each_episode() -> None:
@@ -223,9 +239,9 @@ def test_on_a_gpu_updates_are_launched_before_waiting_for_the_actions(
     order: list[str] = []
     update, act = run.update, run.collector.act
 
-    def recorded_update() -> dict[str, torch.Tensor]:
+    def recorded_update(step: int) -> dict[str, torch.Tensor]:
         order.append("learn")
-        return update()
+        return update(step)
 
     def recorded_act(actions: NDArray[np.float32]) -> None:
         order.append("act")
@@ -287,7 +303,8 @@ def test_the_seed_determines_the_weights() -> None:
 
 def test_the_frame_stack_for_acting_equals_that_of_the_replay() -> None:
     run = SmallRun(dataclasses.replace(CONFIG, steps=10, seed_steps=10))
-    env, stack = DotEnv(), FrameStack(3, ("image",), CPU)
+    env = DotEnv()
+    stack = FrameStack(modalities_of(env.observation_space), 3, CPU)
     run.finish()
     observation, _ = env.reset(seed=run.randomness.environment())
     stack.reset(observation)
@@ -352,7 +369,8 @@ def test_the_success_share_counts_only_steps_with_a_report() -> None:
 def test_a_reused_frame_does_not_change_the_stack() -> None:
     """A camera driver may return the same array in every step."""
     buffer = np.zeros((2, 2, 1), np.uint8)
-    stack = FrameStack(3, ("camera",), CPU)
+    modalities = {"camera": Image(spaces.Box(0, 255, (2, 2, 1), np.uint8))}
+    stack = FrameStack(modalities, 3, CPU)
     stack.reset({"camera": buffer})
     for value in (1, 2):
         buffer[:] = value
@@ -364,7 +382,7 @@ def test_a_reused_frame_does_not_change_the_stack() -> None:
 def test_shifts_in_the_replay_and_in_the_agent_give_the_same_weights(pad: int) -> None:
     agent = dataclasses.replace(CONFIG.agent, shift_pad=pad)
     run, twin = (SmallRun(dataclasses.replace(CONFIG, agent=agent)) for _ in range(2))
-    twin.update = lambda: twin.agent.update(twin.replay.sample(8, twin.randomness.batches))
+    twin.update = plain_update(twin.agent, twin.replay, twin.randomness, run.config)
     run.finish()
     twin.finish()
     assert torch.equal(run.weights(), twin.weights())
@@ -381,14 +399,13 @@ def test_updates_on_the_device_equal_those_from_the_host(agent: MERLConfig) -> N
     """The code for a GPU runs on the CPU; the twin makes the usual update from each batch."""
     run = SmallRun(dataclasses.replace(CONFIG, agent=agent))
     twin = SmallRun(run.config).agent
-    copy = OnDevice(run.replay.rings, CPU)
+    copy = DeviceReplay(run.replay, CPU)
     on_device = UpdateOnDevice(run.agent, copy, 8, seed=5)
     same = torch.Generator().manual_seed(5)
 
-    def compared_update() -> dict[str, torch.Tensor]:
-        metrics = on_device()
-        twin.step = run.agent.step
-        expected = twin.update(copy.sample(8, same))
+    def compared_update(step: int) -> dict[str, torch.Tensor]:
+        metrics = on_device(step)
+        expected = twin.update(copy.sample(8, same), step=step)
         for name, value in metrics.items():
             assert torch.equal(value, expected[name]), name
         return metrics

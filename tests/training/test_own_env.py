@@ -94,7 +94,7 @@ def test_a_user_environment_with_two_cameras(tmp_path: Path) -> None:
 
     call(
         *("train", "my_arm:Arm", *SHORT, "--run-dir", "front"),
-        *("--agent.images", "front", "--agent.vectors"),
+        *("--agent.keys", "front"),
     )
     record = json.loads((tmp_path / "front" / "config.json").read_text())
     assert list(record["observation_space"]) == ["front"]
@@ -335,8 +335,8 @@ def test_resume_and_evaluate_refuse_an_environment_with_other_spaces(
         (["CartPole-v1"], "actions are Discrete(2)"),
         (["Pendulum-v1", "--agent", "drqv2"], "or use --agent merl_state, ddpg or sac"),
         (
-            ["merl.envs.dot:whole", "--agent", "sac", "--agent.vectors", "state"],
-            "agent.vectors names 'state', but the environment gives ['joints']",
+            ["merl.envs.dot:whole", "--agent", "sac", "--agent.keys", "state"],
+            "agent.keys names 'state', but the observation has ['image', 'joints']",
         ),
         (["reach_duplo", "--env.image-layout", "chw"], "for your own environment"),
         (["reach_duplo", "--env.allow-wide-actions"], "for your own environment"),
@@ -363,7 +363,7 @@ def test_resume_and_evaluate_refuse_an_environment_with_other_spaces(
         (["gymnasium:make"], "takes no arguments"),
         (["merl/MoveBox-v0"], "use its name, move_box"),
         (["merl:merl/MoveBox-v0"], "use its name, move_box"),
-        (["merl.envs.dot:whole", "--agent", "ddpg", "--agent.vectors", "x"], "or add 'x' to the"),
+        (["merl.envs.dot:whole", "--agent", "ddpg", "--agent.keys", "x"], "or add 'x' to the"),
     ],
 )
 def test_bad_input_is_reported_in_one_line_and_leaves_no_files(

@@ -117,7 +117,7 @@ def test_a_failing_compilation_is_skipped_and_reported(monkeypatch: pytest.Monke
     def fail(*_: object) -> None:
         raise RuntimeError("no compiler\n  at all")
 
-    monkeypatch.setattr("merl.agents.ddpg.compile_parts", fail)
+    monkeypatch.setattr("merl.accelerate.networks.compile_networks", fail)
     monkeypatch.setattr(timing, "worth_compiling", lambda *_: True)
     env = DotEnv()
     env.length = 10_000
@@ -150,12 +150,10 @@ def test_timing_averages_updates_with_and_without_the_actor(
     clock, made = [0.0], [0]
 
     class Agent:
-        config, device = MERLConfig(actor_every=3), torch.device("cpu")
-
-        def update(self, batch: object) -> dict[str, torch.Tensor]:
+        def update(self, batch: object, *, step: int) -> dict[str, torch.Tensor]:
             made[0] += 1
             clock[0] += 5.0 if made[0] % 3 == 0 else 2.0
             return {"critic_loss": torch.tensor(0.0)}
 
     monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
-    assert timing._time_update(Agent(), None) == 3.0  # type: ignore[arg-type]
+    assert timing._time_update(Agent(), None, torch.device("cpu"), 3) == 3.0  # type: ignore[arg-type]

@@ -136,11 +136,12 @@ def test_the_reason_for_an_unused_key_names_the_option() -> None:
     config = config_of("drqv2")
     left_out = key_lines(config, make_run_env(config))[-1]
     assert (
-        "'joints' is not used: agent drqv2 uses no vectors, --agent.vectors adds them" in left_out
+        "'joints' is not used: agent drqv2 uses no vectors, --agent.modalities vector adds them"
+        in left_out
     )
-    config = config_of("merl", images=("mask",))
+    config = config_of("merl", keys=("mask", "joints"))
     assert (
-        "'pixels' is not used: --agent.images names others"
+        "'pixels' is not used: --agent.keys names others"
         in key_lines(config, make_run_env(config))[-1]
     )
 
@@ -163,31 +164,26 @@ def test_merls_own_tasks_use_the_state_only_if_it_is_named() -> None:
         "images used: image (32 x 32 x 3, from 0 to 255)",
         "vectors used: proprio (24 numbers)",
     ]
-    assert AGENTS["ddpg"].vectors == compose("smoke", "reach_duplo", "ddpg").agent.vectors
+    assert AGENTS["ddpg"].config.keys == compose("smoke", "reach_duplo", "ddpg").agent.keys
 
 
 def test_a_run_prints_its_keys_and_resumes_with_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """This includes a run of an earlier version, which recorded neither `user_env` nor the keys."""
     run = tmp_path / "run"
-    keys = ["--agent.vectors", "joints", "--agent.images", "mask"]
+    keys = ["--agent.keys", "joints", "mask"]
     line = ["train", f"{here}:Arm", *SMALL, "--run-dir", str(run)]
     assert main([*line, *keys]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "images used: mask (24 x 26 x 1, from 0 to 1)" in printed
-    assert "'pixels' is not used: --agent.images names others" in printed
-    file = run / "config.json"
-    record = json.loads(file.read_text())
+    assert "'pixels' is not used: --agent.keys names others" in printed
+    record = json.loads((run / "config.json").read_text())
     assert record["observation_space"]["mask"]["bounds"] == [0, 1]
     policy = merl.load_policy(run)
-    encoder = policy._agent.networks.encoders.images["mask"]  # type: ignore[attr-defined]
-    assert (encoder._low, encoder._high) == (0, 1)
-    del record["config"]["user_env"]
-    record["config"]["agent"] |= {"images": None, "vectors": None}
-    file.write_text(json.dumps(record))
+    encoder = policy._agent.networks.encoders.by_key["mask"]  # type: ignore[attr-defined]
+    assert encoder.frames.bounds == (0, 1)
     agent = Run.open(run).config.agent
-    assert (agent.images, agent.vectors) == (("mask",), ("joints",))
+    assert agent.keys == ("mask", "joints")
     assert main([*line, "--resume", "--steps", "50"]) == 0
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import logging
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -21,6 +21,9 @@ NORMALIZERS = (
     vector.NormalizeObservation,
     vector.NormalizeReward,
 )
+
+
+_LOG = logging.getLogger(__name__)
 
 
 def refuse_running_statistics(env: gymnasium.Env[Any, Any]) -> None:
@@ -56,21 +59,19 @@ def check_instances(env: gymnasium.Env[Any, Any], eval_env: gymnasium.Env[Any, A
         MerlError: the environment cannot be reset.
     """
     if env.unwrapped is eval_env.unwrapped:
-        warnings.warn(
+        _LOG.warning(
             "training and evaluation use the same environment object: each evaluation resets it; "
-            "--eval.every 0 trains without evaluations",
-            stacklevel=1,
+            "--eval.every 0 trains without evaluations"
         )
     with kept_generators(eval_env):
         first, _, second = (_first_observation(eval_env, seed) for seed in (0, 1, 0))
     differing = [key for key in first if not _equal(first[key], second[key])]
     if differing:
-        warnings.warn(
-            f"the first observation after resets with the same seed differs in "
-            f"{', '.join(map(repr, differing))}: evaluations will not have the same start states; "
-            "if a wrapper keeps state across resets, the trained policy will later get different "
-            "observations",
-            stacklevel=1,
+        _LOG.warning(
+            "the first observation after resets with the same seed differs in %s: evaluations will "
+            "not have the same start states; if a wrapper keeps state across resets, the trained "
+            "policy will later get different observations",
+            ", ".join(map(repr, differing)),
         )
 
 

@@ -13,45 +13,55 @@ import torch
 from numpy.typing import NDArray
 
 from merl.core import Observation
+from merl.modalities import Modality
 
 
 class FrameStack:
-    """The last frames of each image, for acting.
+    """The last frames of each camera and the newest other values, as stored, for acting.
 
     The replay stores single frames and makes the same stack when sampling. At the start of an
     episode the first frame is repeated.
 
     Args:
+        modalities: the modality of each key.
         frames: number of frames in a stack, K.
-        images: keys of the images; all other keys are vectors and are not stacked.
         device: device of the stacked observations.
     """
 
-    def __init__(self, frames: int, images: tuple[str, ...], device: torch.device) -> None:
-        self._frames = {key: deque[NDArray[Any]](maxlen=frames) for key in images}
-        self._length = frames
-        self.device = device
-        self._vectors: dict[str, NDArray[Any]] = {}
+    def __init__(
+        self, modalities: Mapping[str, Modality], frames: int, device: torch.device
+    ) -> None:
+        self._modalities, self._length, self.device = modalities, frames, device
+        self._last: dict[str, deque[NDArray[Any]]] = {
+            key: deque(maxlen=frames if modality.stacked else 1)
+            for key, modality in modalities.items()
+        }
 
-    def reset(self, observation: Observation) -> None:
-        """Start an episode with its first observation."""
-        for key, frames in self._frames.items():
-            frames.extend([observation[key].copy()] * (self._length - 1))
-        self.push(observation)
+    def reset(self, observation: Observation) -> Observation:
+        """Start an episode with its first observation; return it as stored."""
+        for _ in range(self._length):
+            stored = self.push(observation)
+        return stored
 
-    def push(self, observation: Observation) -> None:
-        """Add the observation after a step."""
-        for key, frames in self._frames.items():
-            frames.append(observation[key].copy())  # an environment may reuse the array
-        self._vectors = {k: v for k, v in observation.items() if k not in self._frames}
+    def push(self, observation: Observation) -> Observation:
+        """Add the observation after a step; return it as stored."""
+        stored = {key: m.to_stored(observation[key]) for key, m in self._modalities.items()}
+        for key, modality in self._modalities.items():
+            # An environment may reuse the array.
+            value = stored[key].copy() if modality.stacked else stored[key]
+            self._last[key].append(value)
+        return stored
 
     def observation(self) -> dict[str, torch.Tensor]:
-        """Return a batch of size one: images uint8 (1, K, H, W, C), vectors (1, n)."""
+        """Return a batch of size one: (1, K, *shape) of stacked frames, else (1, *shape)."""
         return side_by_side([self])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the stacked observation as NumPy arrays, without a batch dimension."""
-        return {key: np.stack(frames) for key, frames in self._frames.items()} | self._vectors
+        return {
+            key: np.stack(last) if self._modalities[key].stacked else last[-1]
+            for key, last in self._last.items()
+        }
 
 
 def side_by_side(stacks: Sequence[FrameStack]) -> dict[str, torch.Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import warnings
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, SupportsFloat
@@ -16,16 +16,27 @@ from gymnasium.wrappers import FilterObservation
 
 from merl.acting.env_checks import refuse_running_statistics
 from merl.acting.generators import global_state, set_global_state
-from merl.agents.config import AgentConfig
-from merl.agents.networks import modalities, privileged_keys
+from merl.agents.config import ObservationConfig
+from merl.agents.networks import observation_spec
 from merl.config import TrainConfig
-from merl.core import MerlError, is_image
+from merl.core import Kind, MerlError
 from merl.core.signals import handlers_kept
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
-from merl.envs.config import OBSERVATIONS, EnvConfig
+from merl.envs.config import OBSERVATION_KINDS, EnvConfig, ObservationKey
 from merl.envs.user_env import MakeEnv, make_user_env
 from merl.envs.user_spaces import brief
+from merl.modalities import ObservationSpec
+
+PLURALS: dict[Kind, str] = {
+    "image": "images",
+    "depth": "depth images",
+    "vector": "vectors",
+    "sequence": "histories",
+}
+"""Kinds of observations in the plural, for people."""
+
+_LOG = logging.getLogger(__name__)
 
 
 def make_run_env(
@@ -98,17 +109,19 @@ class Supervised(gymnasium.Wrapper[Any, Any, Any, Any]):
             with handlers_kept():
                 self.env.close()
         except KeyboardInterrupt:
-            warnings.warn("closing the environment was interrupted", stacklevel=1)
+            _LOG.warning("closing the environment was interrupted")
+
+
+def run_spec(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> ObservationSpec:
+    """Return what the agent of a run observes in its environment."""
+    assert isinstance(env.observation_space, spaces.Dict)
+    return observation_spec(config.agent, env.observation_space, config.replay.frame_stack)
 
 
 def run_spaces(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Box]:
     """Return the observation keys that the agent uses, with their spaces, and the action space."""
-    space = env.observation_space
-    assert isinstance(space, spaces.Dict)
     assert isinstance(env.action_space, spaces.Box)
-    images, vectors = modalities(config.agent, space)
-    keys = (*images, *vectors, *privileged_keys(config.agent, space))
-    return spaces.Dict({key: space[key] for key in keys}), env.action_space
+    return run_spec(config, env).space, env.action_space
 
 
 def own_bounds(env: gymnasium.Env[Any, Any]) -> tuple[list[float], list[float]] | None:
@@ -184,43 +197,33 @@ def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
         env: the environment from `make_run_env`.
 
     Returns:
-        One line each for images, vectors, privileged vectors and unused keys, where there are any.
+        One line each for images, depth images, vectors, histories, keys of the critic alone and
+        unused keys, where there are any.
     """
-    space, _ = run_spaces(config, env)
-    images, vectors = modalities(config.agent, space)
-    groups = {
-        "images used": images,
-        "vectors used": vectors,
-        "vectors used by the critic alone": privileged_keys(config.agent, space),
-    }
-    lines = [
-        f"{group}: {', '.join(f'{key} ({_size(space[key])})' for key in keys)}"
-        for group, keys in groups.items()
-        if keys
-    ]
+    spec = run_spec(config, env)
+    groups: dict[str, list[str]] = {}
+    for key, modality in spec.modalities.items():
+        group = f"{PLURALS[modality.kind]} used"
+        if key in spec.privileged:
+            group += " by the critic alone"
+        groups.setdefault(group, []).append(f"{key} ({modality.describe()})")
+    lines = [f"{group}: {', '.join(keys)}" for group, keys in groups.items()]
     left_out = {}
     if env.has_wrapper_attr("left_out"):
-        for key, given in env.get_wrapper_attr("modalities").items():
-            if key in space.spaces:  # `key in space` would test for an observation
+        for key, given in env.get_wrapper_attr("keys").items():
+            if key in spec.modalities:
                 continue
-            kind = "images" if is_image(given.space) else "vectors"
-            left_out[key] = f"--agent.{kind} names others"
-            if not getattr(config.agent, kind):
+            kind = given.modality.kind
+            left_out[key] = "--agent.keys names others"
+            if config.agent.keys is None:
                 left_out[key] = (
-                    f"agent {config.agent_name} uses no {kind}, --agent.{kind} adds them"
+                    f"agent {config.agent_name} uses no {PLURALS[kind]}, --agent.modalities {kind} "
+                    "adds them"
                 )
         left_out |= env.get_wrapper_attr("left_out")
     if left_out:
         lines.append("; ".join(f"{key!r} is not used: {why}" for key, why in left_out.items()))
     return lines
-
-
-def _size(space: spaces.Space[Any]) -> str:
-    assert isinstance(space, spaces.Box)
-    if is_image(space):
-        height, width, channels = space.shape
-        return f"{height} x {width} x {channels}, from {space.low.min()} to {space.high.max()}"
-    return "1 number" if space.shape == (1,) else f"{space.shape[0]} numbers"
 
 
 def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
@@ -255,7 +258,7 @@ def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any]
         env.unwrapped.np_random.bit_generator.state = own
 
 
-def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
+def _asked_for(agent: ObservationConfig, env: EnvConfig) -> tuple[ObservationKey, ...]:
     """Return the observations of a Jaco environment that the agent needs.
 
     These are the keys that the agent names; if it names none, those of the config. `state` is used
@@ -264,19 +267,19 @@ def _asked_for(agent: AgentConfig, env: EnvConfig) -> tuple[str, ...]:
     Raises:
         MerlError: only `state` is left, and the agent does not name it.
     """
-    images, vectors = agent.images, agent.vectors
-    default = [
-        name
-        for name in env.observations
-        if (images is None if name == "image" else vectors is None and name != "state")
-    ]
-    named = {*(images or ()), *(vectors or ()), *agent.privileged}
-    if not named <= set(OBSERVATIONS):  # the check of the agent config reports this
-        return OBSERVATIONS
-    asked = [name for name in OBSERVATIONS if name in named or name in default]
-    if not asked and vectors is None and "state" in env.observations:
-        raise MerlError(
-            f"the agent can use no observation among {sorted(env.observations)}: add "
-            "--agent.vectors state, or use --agent merl_state, ddpg or sac"
+    named = agent.keys
+    if named is None:
+        named = tuple(
+            name
+            for name in env.observations
+            if OBSERVATION_KINDS[name] in agent.modalities and name != "state"
         )
-    return tuple(asked) or env.observations
+        if not named and "state" in env.observations:
+            raise MerlError(
+                f"the agent can use no observation among {sorted(env.observations)}: add "
+                "--agent.keys state, or use --agent merl_state, ddpg or sac"
+            )
+    asked = {*named, *agent.privileged}
+    if not asked <= set(OBSERVATION_KINDS):  # the check of the agent config reports this
+        return tuple(OBSERVATION_KINDS)
+    return tuple(name for name in OBSERVATION_KINDS if name in asked) or env.observations

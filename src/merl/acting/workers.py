@@ -7,7 +7,7 @@ import pickle
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Timer
@@ -28,12 +28,13 @@ from merl.acting.run_env import (
     make_run_env,
     set_environment_state,
 )
+from merl.agents.config import ObservationConfig
 from merl.config import TrainConfig
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
 from merl.core.output import tolerate_lost_output
 from merl.core.python_path import set_value, users_value, working_folder_hidden
-from merl.envs.user_env import MakeEnv, imports_code, load_module, module_folder
-from merl.envs.wrappers import in_one_line
+from merl.core.user_code import in_one_line, module_folder
+from merl.envs.user_env import MakeEnv, imports_code, load_module
 
 _INFO = ("success", "reward_terms")
 """Keys of an environment's info that the training loop uses."""
@@ -150,9 +151,13 @@ class WorkerEnvs:
     def _started(self) -> AsyncVectorEnv:
         self._lost = None
         expected = EnvSpaces.of(self._config, self._here)
-        folder = module_folder(self._config.task)
+        folder, config = module_folder(self._config.task), self._config
+        if ":" in config.agent_name:  # a worker does not need the user's class of config
+            agent = config.agent
+            keys = ObservationConfig(agent.keys, agent.modalities, agent.privileged)
+            config = replace(config, agent=keys)
         makers = [
-            _Maker(self._config, index, expected, self._here, folder, self._make)
+            _Maker(config, index, expected, self._here, folder, self._make)
             for index in range(self.count)
         ]
         others = multiprocessing.active_children()

@@ -1,14 +1,14 @@
-"""Config of an agent: its networks and how it learns. Each agent is a choice of these values."""
+"""Config of an agent: the keys that it observes, its networks, and how it learns."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal, get_args
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, get_args
 
-from merl.core import MerlError, check_choice
-from merl.networks.fusion import Squash
+from merl.core import Kind, MerlError
+from merl.core.fields import NOT_EMPTY, Range, check_fields
+from merl.networks.fusion import FusionLayer
 from merl.networks.returns import HLGauss
 
 Precision = Literal["auto", "fp32", "bf16"]
@@ -19,31 +19,65 @@ TorchCompile = Literal["auto", "yes", "no"]
 
 WIDEST = 65_536
 """Upper bound of layer widths and other counts in the config."""
+Count = Annotated[int, Range(1, WIDEST)]
+Width = Annotated[int, Range(0, WIDEST)]
+Positive = Annotated[float, Range(0, without=0)]
+NotNegative = Annotated[float, Range(0)]
+Share = Annotated[float, Range(0, 1, without=0)]
 
 
 @dataclass(frozen=True)
-class AgentConfig:
-    """Networks of an agent and how it learns; the defaults are from Table 1 and Appendix C.1."""
+class ObservationConfig:
+    """Base of every agent's config: the keys that it observes."""
 
-    images: tuple[str, ...] | None = None
-    """Image keys to use; if not set, every image that the environment gives."""
-    vectors: tuple[str, ...] | None = None
-    """Vector keys to use; if not set, every vector that the environment gives, except the
+    keys: tuple[str, ...] | None = None
+    """Observation keys to use; if not set, every key of the kinds in `modalities`, except the
     privileged ones. In merl's own tasks, `state` is used only if it is named."""
+    modalities: tuple[Kind, ...] = get_args(Kind)
+    """Kinds of observations to use if `keys` is not set."""
     privileged: tuple[str, ...] = ()
-    """Vector keys that only the critic observes, e.g. `state`: known in training only (asymmetric
+    """Keys that only the critic observes, e.g. `state`: known in training only (asymmetric
     critic)."""
-    learning_rate: float = 1e-4
+
+    def __post_init__(self) -> None:
+        check_fields(self, "agent.")
+
+
+@dataclass(frozen=True)
+class UnloadedConfig(ObservationConfig):
+    """Config of a user's agent, as recorded in a run, before the agent's code is imported."""
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    """Every recorded value, by name."""
+
+
+@dataclass(frozen=True)
+class AgentConfig(ObservationConfig):
+    """Networks of an agent and how it learns; the defaults are from Table 1 and Appendix C.1.
+
+    Each agent of merl is a choice of these values.
+    """
+
+    encoders: dict[str, str] = field(default_factory=dict)
+    """Encoder of a key, by its name (`--agent.encoders.wrist impala`): conv, impala or a model of
+    timm for images; identity, mlp, conv1d or transformer for numbers; or `module:Class`. If not
+    set: conv for images, identity for vectors, conv1d for histories."""
+    encoder_weights: dict[str, str] = field(default_factory=dict)
+    """File with the initial weights of a key's encoder, for models of timm. It is read once, when
+    the run starts."""
+    frozen_encoders: tuple[str, ...] = ()
+    """Keys whose encoders are not trained."""
+    learning_rate: Positive = 1e-4
     """Step size of Adam, for every network."""
-    learning_rate_end: float | None = None
+    learning_rate_end: Positive | None = None
     """Step size at the end of a linear decay over `learning_rate_steps`; if not set, it is
     constant."""
-    learning_rate_steps: int = 500_000
+    learning_rate_steps: Annotated[int, Range(1, 10**12)] = 500_000
     """Environment steps of the decay of the step size."""
     critic_loss: CriticLoss = "mse"
     """Loss of the critic: the mean squared error (mse), or the cross-entropy of a histogram of
     returns (hl_gauss; Farebrother et al. 2024)."""
-    critic_bins: int = 101
+    critic_bins: Annotated[int, Range(HLGauss.FEWEST, WIDEST)] = 101
     """Bins of the histogram, including three beyond each bound."""
     critic_low: float = 0.0
     """Lowest return of the histogram, in units of reward. Lower targets are clipped to it: set it
@@ -51,53 +85,54 @@ class AgentConfig:
     critic_high: float | None = None
     """Highest return of the histogram; if not set, 1 / (1 - discount), the bound for rewards in
     [0, 1]. Higher targets are clipped to it: set it if rewards can be above 1."""
-    actor_every: int = 1
+    actor_every: Count = 1
     """Update the actor only in every n-th update (delayed policy updates, TD3); critic, encoders
     and target are updated every time."""
-    actor_average: float | None = None
+    actor_average: Share | None = None
     """Evaluate and deploy an exponential moving average of the actor and its fusion. This is the
     weight of the newest weights at each update of the actor, in (0, 1], e.g. 0.001; if not set,
     there is no average. Exploration and updates always use the newest weights."""
-    tau: float = 0.01
+    tau: Share = 0.01
     """Weight of the critic in the target network's moving average at each update, in (0, 1]."""
-    noise_std: float = 0.2
+    noise_std: NotNegative = 0.2
     """Standard deviation of the exploration noise, also used in updates of critic and actor."""
-    noise_std_end: float | None = None
+    noise_std_end: NotNegative | None = None
     """Final standard deviation, reached linearly over `noise_steps`; if not set, it is constant."""
-    noise_steps: int = 500_000
+    noise_steps: Annotated[int, Range(1, 10**12)] = 500_000
     """Environment steps over which the standard deviation changes."""
-    noise_correlation: float = 0.0
+    noise_correlation: Annotated[float, Range(0, 1, without=1)] = 0.0
     """Correlation of the exploration noise between consecutive actions, in [0, 1). Its standard
     deviation does not change. In updates the noise is uncorrelated."""
-    noise_clip: float = 0.3
+    noise_clip: NotNegative = 0.3
     """Bound of the noise in the updates of critic and actor; when acting, noise is not clipped."""
     target: Target = "heads"
     """Networks that have a target copy: the Q-heads (MERL), or the critic's fusion too, as DrQ-v2's
     target includes its trunk."""
-    latent_dim: int = 128
+    latent_dim: Width = 128
     """d, the length of the fused representation: an equal share for each modality, rounded down. 0
     disables the fusion: the heads receive the concatenated encodings."""
     fusion: FusionOwner = "decoupled"
     """Fusions of critic and actor (Figure 3a): one each (decoupled), or one for both, trained by
     the critic's loss (shared) or by both losses (shared_by_both)."""
+    fusion_layer: FusionLayer = "tanh"
+    """What the fusion applies to each key's linear projection: tanh (MERL), a softmax over groups
+    of eight numbers (simnorm), or attention between the keys and tanh (attention)."""
     fusion_norm: bool = True
     """LayerNorm in the fusion (Figure 3c)."""
-    squash: Squash = "tanh"
-    """Bound of the fused representation: tanh, or a softmax over groups of eight (simnorm)."""
-    shift_pad: int = 4
+    shift_pad: Width = 4
     """Random shift, in pixels to each side; 0 disables it."""
-    conv_channels: int = 32
+    conv_channels: Count = 32
     """Channels of each convolution of the image encoder."""
-    conv_strides: tuple[int, ...] = (2, 1, 1, 1)
+    conv_strides: Annotated[tuple[Count, ...], NOT_EMPTY] = (2, 1, 1, 1)
     """Strides of the image encoder's convolutions."""
-    vector_encoder_dim: int = 0
-    """Width of the MLP that encodes each vector; 0 disables the MLP (Figure 5)."""
+    mlp_dim: Count = 64
+    """Width of encoder `mlp` (Figure 5)."""
     standardize: bool = False
-    """Standardise each vector by the mean and the deviation of the first batches; the paper uses
-    raw vectors."""
-    head_layers: int = 3
+    """Standardise vectors and histories by the mean and the deviation of the first batches; the
+    paper uses raw vectors."""
+    head_layers: Count = 3
     """Linear layers of actor and critic, with the output layer (paper: 3 for reach, else 6)."""
-    hidden_dim: int = 1024
+    hidden_dim: Count = 1024
     """Width of the hidden layers of actor and critic."""
     head_norm: bool = True
     """LayerNorm in the hidden layers of actor and critic."""
@@ -109,56 +144,19 @@ class AgentConfig:
     which tries it once on a GPU in a long run, and keeps it if it is faster."""
 
     def __post_init__(self) -> None:
-        for name, value in self._given("learning_rate", "learning_rate_end"):
-            if not 0 < value < math.inf:
-                raise MerlError(f"agent.{_flag(name)} must be above 0, not {value}")
-        for name, choice, choices in (
-            ("precision", self.precision, get_args(Precision)),
-            ("target", self.target, get_args(Target)),
-            ("squash", self.squash, get_args(Squash)),
-            ("critic-loss", self.critic_loss, get_args(CriticLoss)),
-            ("fusion", self.fusion, get_args(FusionOwner)),
-            ("torch-compile", self.torch_compile, get_args(TorchCompile)),
-        ):
-            check_choice(f"agent.{name}", choice, choices)
-        for name, value in self._given("tau", "actor_average"):
-            if not 0 < value <= 1:
-                raise MerlError(f"agent.{_flag(name)} must lie in (0, 1], not {value}")
-        for name, value in self._given("noise_std", "noise_std_end"):
-            if not 0 <= value < math.inf:
-                raise MerlError(f"agent.{_flag(name)} must be at least 0, not {value}")
-        if not 0 <= self.noise_correlation < 1:
-            raise MerlError(
-                f"agent.noise-correlation must lie in [0, 1), not {self.noise_correlation}"
-            )
-        if not self.noise_clip >= 0:
-            raise MerlError(f"agent.noise-clip must be at least 0, not {self.noise_clip}")
-        least = {"conv_channels": 1, "head_layers": 1, "hidden_dim": 1}
-        least |= {"noise_steps": 1, "learning_rate_steps": 1, "critic_bins": HLGauss.FEWEST}
-        least |= {"actor_every": 1, "latent_dim": 0, "shift_pad": 0, "vector_encoder_dim": 0}
-        for name, bound in least.items():
-            most = 10**12 if name.endswith("_steps") else WIDEST
-            if not bound <= getattr(self, name) <= most:
-                raise MerlError(
-                    f"agent.{_flag(name)} must be at least {bound} and at most {most}, "
-                    f"not {getattr(self, name)}"
-                )
+        super().__post_init__()
         self._check_histogram()
-        for name in ("fusion", "fusion_norm", "squash"):
+        if self.privileged and self.fusion != "decoupled":
+            raise MerlError(
+                f"agent.privileged {self.privileged} needs separate fusions for critic and actor: "
+                f"use --agent.fusion decoupled instead of {self.fusion}"
+            )
+        for name in ("fusion", "fusion_norm", "fusion_layer"):
             if self.latent_dim == 0 and getattr(self, name) != getattr(AgentConfig, name):
                 raise MerlError(
                     f"agent.{_flag(name)} {getattr(self, name)} is an option of the fusion, "
                     "which agent.latent-dim 0 disables: remove it, or set a latent-dim above 0"
                 )
-        if not self.conv_strides or min(self.conv_strides) < 1:
-            raise MerlError(
-                f"agent.conv-strides {self.conv_strides} must give a stride of at least 1 for each "
-                "convolution, and at least one convolution"
-            )
-
-    def _given(self, *names: str) -> Iterator[tuple[str, float]]:
-        """Yield the named fields that are set, with their values."""
-        return ((name, value) for name in names if (value := getattr(self, name)) is not None)
 
     def _check_histogram(self) -> None:
         for name in ("critic_bins", "critic_low", "critic_high"):
@@ -168,8 +166,6 @@ class AgentConfig:
                     f"agent.{_flag(name)} {value} is an option of the histogram, and "
                     "agent.critic-loss mse has none: remove it, or use --agent.critic-loss hl_gauss"
                 )
-            if value is not None and not math.isfinite(value):
-                raise MerlError(f"agent.{_flag(name)} must be finite, not {value}")
         if self.critic_high is not None and not self.critic_low < self.critic_high:
             raise MerlError(
                 f"agent.critic-high must be above agent.critic-low {self.critic_low}, "

@@ -4,30 +4,30 @@ An update learns from a batch of (o_t, a_t, r_{t:t+n-1}, o_{t+n}); the agent's n
 the observations. The methods `update_critic`, `update_actor` and `update_target` follow
 Algorithm 1.
 
-Agent `ddpg` is this learner on the state, without changes (docs/agents/ddpg.md).
+Agent `ddpg` is this learner on the state, without changes (docs/explanation/agents/ddpg.md).
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from torch import Tensor, nn
 
-from merl.agents.compiling import compile_parts
 from merl.agents.config import AgentConfig
 from merl.agents.gradients import clamp_straight_through, frozen
-from merl.agents.networks import Networks
+from merl.agents.networks import make_networks
 from merl.agents.optimizers import adam, load_optimizer, set_step_size, step_optimizer
-from merl.agents.update_noise import UpdateNoise
-from merl.core import Batch, FrameTransforms
+from merl.core import Batch, FrameTransforms, UpdateNoise, UpdatePlan
 from merl.networks.augmentation import RandomShift, draw_shifts
 from merl.networks.critic import TwinCritic
+from merl.networks.heads import Actor, GaussianActor
 from merl.networks.settings import with_torch_settings
 
 
@@ -35,10 +35,8 @@ from merl.networks.settings import with_torch_settings
 class DDPGConfig(AgentConfig):
     """DDPG on the state, with clipped double Q (Fujimoto et al. 2018) and 3-step returns."""
 
-    images: tuple[str, ...] | None = ()
-    """Image keys to use: none."""
-    vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to use."""
+    keys: tuple[str, ...] | None = ("state",)
+    """Observation keys to use."""
     latent_dim: int = 0
     """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
     head_norm: bool = False
@@ -48,45 +46,40 @@ class DDPGConfig(AgentConfig):
 class DDPG:
     """Off-policy actor-critic of the paper.
 
-    Args:
-        networks: freshly initialised networks; moved to `device`.
-        config: how to learn; `precision` "auto" means fp32 here, `torch_compile` "auto" means no.
-        seed: seed of the noise and the shifts.
-        device: device of the networks, the optimizers and the random generators.
-        threads: CPU threads of acting and updates; None keeps torch's setting.
+    The arguments are those of `merl.agents.make_agent`, which also seeds the initial weights. In
+    the config, `precision` "auto" means fp32 here.
 
     Attributes:
-        step: environment steps so far, on which the noise may depend; set by the caller.
-        sigma: standard deviation of the noise in updates as a tensor on the device, from which a
-            CUDA graph reads it; None: computed from the config and `step`.
         updates: critic updates so far; they determine when the actor is updated.
     """
 
+    actor_class: ClassVar[type[Actor] | type[GaussianActor]] = Actor
+
     def __init__(
         self,
-        networks: Networks,
         config: AgentConfig,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
         *,
+        frame_stack: int,
         seed: int,
         device: torch.device,
         threads: int | None = None,
     ) -> None:
-        self.step = self.updates = 0
-        self.sigma: Tensor | None = None
+        self.updates = 0
         self.acting_noise: Tensor | None = None
         self.config = config
         self.device, self.threads = device, threads
-        self.networks = networks.to(device)
+        self.networks = networks = make_networks(
+            config, observation_space, action_space.shape[0], frame_stack, self.actor_class
+        ).to(device)
         # The target uses the newest fusion, unless the config gives the fusion a target too.
         self.critic_target = nn.ModuleDict(copy.deepcopy(self._averaged())).requires_grad_(False)
         parts = networks.encoders, networks.critic_fusion, networks.critic
-        self.critic_parameters = [parameter for part in parts for parameter in part.parameters()]
+        self.critic_parameters = [p for part in parts for p in part.parameters() if p.requires_grad]
         self.actor_parameters = [*self._actors_fusion(), *networks.actor.parameters()]
-        self._optimizers: list[torch.optim.Adam] = []
-        self.critic_optimizer = self._adam(self.critic_parameters)
-        self.actor_optimizer = self._adam(self.actor_parameters)
-        if config.torch_compile == "yes":
-            compile_parts(self.networks, self.critic_target, self.device)
+        self.critic_optimizer = adam(self.critic_parameters, config.learning_rate)
+        self.actor_optimizer = adam(self.actor_parameters, config.learning_rate)
         words = np.random.SeedSequence(seed).generate_state(2)
         self.acting, self.learning = (
             torch.Generator(device).manual_seed(int(word)) for word in words
@@ -101,14 +94,15 @@ class DDPG:
 
     @with_torch_settings
     @torch.inference_mode()
-    def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
+    def act(self, observation: Mapping[str, Tensor], *, explore: bool, step: int) -> Tensor:
         """Compute a_t = pi(h_actor(f(o_image), g(o_prop))) + epsilon, epsilon ~ N(0, sigma^2).
 
         The noise is not clipped.
 
         Args:
-            observation: images uint8 (B, K, H, W, C), vectors float32 (B, n), on the device.
+            observation: as in `Batch`, on the device.
             explore: add the noise; if False, the averaged actor acts, if there is one.
+            step: environment steps so far, on which sigma may depend.
 
         Returns:
             Actions (B, A), in [-1, 1].
@@ -122,39 +116,44 @@ class DDPG:
             if self.acting_noise is not None:
                 noise = correlation * self.acting_noise + (1 - correlation**2) ** 0.5 * noise
             self.acting_noise = noise
-        return (mean + self.config.noise(self.step) * noise).clamp(-1.0, 1.0)
+        return (mean + self.config.noise(step) * noise).clamp(-1.0, 1.0)
 
     # Learning -------------------------------------------------------------------------------
 
-    @property
-    def actor_is_due(self) -> bool:
-        """Whether the next update trains the actor: the last of every `actor_every` updates."""
-        return (self.updates + 1) % self.config.actor_every == 0
+    def update(
+        self, batch: Batch, noise: UpdateNoise | None = None, *, step: int
+    ) -> dict[str, Tensor]:
+        """Make an update; the noise is drawn if it is not given. See `Agent.update`."""
+        plan = self.plan(step)
+        if noise is None:
+            noise = self.draw(len(batch.action), plan)
+        return self.learn(batch.to(self.device), noise, plan)
 
-    def update(self, batch: Batch) -> dict[str, Tensor]:
-        """Draw noise and shifts, and call `learn` with the batch and these."""
-        return self.learn(batch.to(self.device), self.draw(len(batch.action)))
+    def plan(self, step: int) -> UpdatePlan:
+        """Begin an update; the last of every `actor_every` updates trains the actor."""
+        self.updates += 1
+        trains_actor = self.updates % self.config.actor_every == 0
+        return UpdatePlan(trains_actor, self.config.noise(step), self.config.step_size(step))
 
     @with_torch_settings
-    def learn(self, batch: Batch, draws: UpdateNoise) -> dict[str, Tensor]:
+    def learn(self, batch: Batch, noise: UpdateNoise, plan: UpdatePlan) -> dict[str, Tensor]:
         """Augment and encode the batch; update the critic, the actor if due, and the target."""
-        if self.sigma is None:  # else `Recorded` sets step size and noise on the device
-            self.set_step_size()
+        for optimizer in self.optimizers():
+            set_step_size(optimizer, plan.step_size)
         encoders = self.networks.encoders
         encoders.observe(batch.observation)
         with self._arithmetic():
-            encoded = encoders(batch.observation, draws.shifts)
+            encoded = encoders(batch.observation, noise.shifts)
             with torch.no_grad():
-                next_encoded = encoders(batch.next_observation, draws.next_shifts)
-        metrics = self.update_critic(encoded, next_encoded, batch, draws.next_noise)
-        if self.actor_is_due:
+                next_encoded = encoders(batch.next_observation, noise.next_shifts)
+        metrics = self.update_critic(encoded, next_encoded, batch, noise.next_noise)
+        if plan.trains_actor:
             # Reuse the features of o_t from before the critic's step, without gradient.
             encoded = {key: features.detach() for key, features in encoded.items()}
-            metrics |= self.update_actor(encoded, draws.actor_noise)
+            metrics |= self.update_actor(encoded, noise.actor_noise)
             if self.config.actor_average is not None:
                 self.networks.update_average(self.config.actor_average)
         self.update_target()
-        self.updates += 1
         return metrics
 
     def update_critic(
@@ -227,39 +226,37 @@ class DDPG:
         torch._foreach_lerp_(average, recent, self.config.tau)
 
     @with_torch_settings
-    def draw(self, size: int) -> UpdateNoise:
-        """Draw the random numbers of the next update, for a batch of `size` samples."""
+    def draw(self, size: int, plan: UpdatePlan) -> UpdateNoise:
+        """Draw the random numbers of an update with a batch of `size` samples."""
         generator = self.learning
         pad, shape = self.networks.encoders.pad, (size, self.networks.actor.action_dim)
-        keys = self.networks.encoders.image_keys if pad else ()
+        keys = self.networks.encoders.shifted
         shifts, next_shifts = (
             {key: draw_shifts(size, pad, generator) for key in keys} for _ in range(2)
         )
         noise, next_noise = (
-            self.epsilon(torch.randn(shape, generator=generator, device=self.device))
+            self.epsilon(torch.randn(shape, generator=generator, device=self.device), plan)
             for _ in range(2)
         )
         return UpdateNoise(shifts, next_shifts, next_noise, noise)
 
-    def copies(self, draws: UpdateNoise) -> tuple[FrameTransforms, FrameTransforms]:
-        """Return the shifts of o_t and o_{t+n} as frame transforms, which replay applies."""
+    def frame_transforms(self, noise: UpdateNoise) -> tuple[FrameTransforms, FrameTransforms]:
+        """Return the shifts of o_t and o_{t+n} as frame transforms, which the replay applies."""
         pad = self.networks.encoders.pad
         now, then = (
             {key: RandomShift(shifts, pad) for key, shifts in each.items()}
-            for each in (draws.shifts, draws.next_shifts)
+            for each in (noise.shifts, noise.next_shifts)
         )
         return now, then
 
-    def epsilon(self, noise: Tensor) -> Tensor:
+    def epsilon(self, noise: Tensor, plan: UpdatePlan) -> Tensor:
         """Scale standard normal numbers to the noise of an update: clip(N(0, sigma^2), -c, c)."""
         clip = self.config.noise_clip
-        sigma = self.config.noise(self.step) if self.sigma is None else self.sigma
-        return noise.mul_(sigma).clamp_(-clip, clip)
+        return noise.mul_(plan.noise_std).clamp_(-clip, clip)
 
-    def set_step_size(self) -> None:
-        """Set the step size for `step`, where it decays."""
-        for optimizer in self._optimizers:
-            set_step_size(optimizer, self.config.step_size(self.step))
+    def optimizers(self) -> list[torch.optim.Adam]:
+        """Return the optimizers, which all have the same step size."""
+        return [self.critic_optimizer, self.actor_optimizer]
 
     # Saving ---------------------------------------------------------------------------------
 
@@ -281,11 +278,11 @@ class DDPG:
         """Restore from `state_dict()`."""
         self.networks.load_state_dict(state["networks"])
         self.critic_target.load_state_dict(state["critic_target"])
-        noise = state.get("acting_noise")
+        noise = state["acting_noise"]
         self.acting_noise = None if noise is None else noise.to(self.device)
         load_optimizer(self.critic_optimizer, state["critic_optimizer"])
         load_optimizer(self.actor_optimizer, state["actor_optimizer"])
-        self.updates = state.get("updates", 0)  # older checkpoints have none
+        self.updates = state["updates"]
         for name in ("acting", "learning"):
             generator: torch.Generator = getattr(self, name)
             # The generators of CPU and CUDA have different states: on another kind of device than
@@ -293,16 +290,18 @@ class DDPG:
             if state[name].shape == generator.get_state().shape:
                 generator.set_state(state[name].cpu())
 
+    @with_torch_settings
+    def load_policy(self, weights: Mapping[str, Mapping[str, Tensor]]) -> None:
+        """Restore the networks from `state_dict()`."""
+        self.networks.load_state_dict(weights["networks"])
+
     # ----------------------------------------------------------------------------------------
 
     def _policy(self, observation: Mapping[str, Tensor], *, averaged: bool) -> Any:
         """Return the actor's output; privileged keys may be missing in the observation."""
         networks = self.networks
         sensed = {key: observation[key] for key in networks.senses}
-        # Eagerly: each batch size of acting would need another compilation.
-        compiled = self.config.torch_compile == "yes"
-        with torch.compiler.set_stance("force_eager") if compiled else nullcontext():
-            return networks.policy(networks.encoders(sensed), averaged=averaged)
+        return networks.policy(networks.encoders(sensed), averaged=averaged)
 
     def _actors_fusion(self) -> Iterator[nn.Parameter]:
         """Yield the fusion weights that the actor's loss trains: its own, or the shared ones."""
@@ -328,15 +327,3 @@ class DDPG:
         """Return a context with autocast to bf16, enabled if the config chooses bf16."""
         enabled = self.config.precision == "bf16"
         return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled)
-
-    def _adam(self, parameters: Sequence[Tensor]) -> torch.optim.Adam:
-        """Make Adam for these parameters, with the config's step size."""
-        on_gpu = self.device.type == "cuda"  # CUDA graphs read step and step size from the device
-        decays = self.config.learning_rate_end is not None
-        rate: float | Tensor = self.config.learning_rate
-        if on_gpu and decays:
-            rate = torch.tensor(rate, device=self.device)
-        optimizer = adam(parameters, rate, capturable=on_gpu)
-        if decays:
-            self._optimizers.append(optimizer)
-        return optimizer

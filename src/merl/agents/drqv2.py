@@ -1,7 +1,7 @@
 """DrQ-v2 (Yarats et al. 2021a): the same learner on images alone.
 
 Its trunk (Linear, LayerNorm and tanh to 50 features; one for the critic and one for the actor) is
-MERL's fusion with a single modality. docs/agents/drqv2.md gives the source of every value.
+MERL's fusion with a single modality. docs/explanation/agents/drqv2.md has each value's source.
 """
 
 from __future__ import annotations
@@ -9,14 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from merl.agents.config import AgentConfig, Target
+from merl.core import Kind
 
 
 @dataclass(frozen=True)
 class DrQV2Config(AgentConfig):
     """DrQ-v2: images alone, with the values of its authors."""
 
-    vectors: tuple[str, ...] | None = ()
-    """Vector keys to use: none."""
+    modalities: tuple[Kind, ...] = ("image", "depth")
+    """Kinds of observations to use if `keys` is not set: cameras alone."""
     latent_dim: int = 50
     """Length of the trunk's output."""
     target: Target = "heads_and_fusion"

@@ -4,14 +4,14 @@ The procedures are in `merl.agents.ddpg`, the values are the defaults of `merl.a
 `merl.agents.networks` builds the networks:
 
     Algorithm 1                           in `Networks` and `DDPG`
-    f_xi, image encoder                   encoders.images[key]: four convolutions, random shift
-    g_zeta, proprioception encoder        encoders.vectors[key]: identity, or an MLP
+    f_xi, image encoder                   encoders.by_key["image"]: four convolutions
+    g_zeta, proprioception encoder        encoders.by_key["proprio"]: identity, or an MLP
     h_psi_critic, h_psi_actor             critic_fusion, actor_fusion: Linear, LayerNorm, tanh
     pi_theta, Q_phi1 and Q_phi2           actor, critic: MLPs with LayerNorm and ReLU
     Q_phi1-bar, Q_phi2-bar                critic_target: a copy of the Q-heads alone
     UPDATECRITIC, UPDATEACTOR             DDPG.update_critic, DDPG.update_actor
 
-Where the paper is silent or contradicts itself, `docs/paper.md` lists the choice made here.
+docs/explanation/paper.md lists the choices made where the paper is silent or contradicts itself.
 """
 
 from __future__ import annotations

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from merl.agents.config import AgentConfig
-from merl.core import MerlError, is_image, is_vector
+from merl.agents.config import AgentConfig, ObservationConfig
+from merl.core import MerlError
+from merl.modalities import Modality, ObservationSpec, modalities_of
 from merl.networks.critic import TwinCritic
-from merl.networks.encoders import ConvEncoder, VectorEncoder
-from merl.networks.fusion import SIMNORM_GROUP, Concatenation, Fusion
+from merl.networks.encoders import EncoderOptions, make_encoder
+from merl.networks.encoders.pretrained import TimmEncoder
+from merl.networks.fusion import GROUPS, Concatenation, Fusion
 from merl.networks.heads import Actor, GaussianActor, HeadSize
 from merl.networks.initialization import orthogonal
+from merl.networks.names import module_name
 from merl.networks.representation import Encoders
 from merl.networks.returns import HLGauss, Returns, Scalar
 
@@ -112,17 +116,18 @@ def make_networks(
     Raises:
         MerlError: the space lacks a key that the agent uses, or the config does not fit the space.
     """
-    images, vectors = modalities(config, space)
+    spec = observation_spec(config, space, stack)
+    for name in ("encoders", "encoder_weights", "frozen_encoders"):
+        _named(name.replace("_", "-"), tuple(getattr(config, name)), spec.modalities)
+    options = EncoderOptions(config.conv_channels, config.conv_strides, config.mlp_dim)
     encoders = Encoders(
-        {key: _image_encoder(config, key, space[key], stack) for key in images},
-        {
-            key: _vector_encoder(config, space[key])
-            for key in (*vectors, *privileged_keys(config, space))
-        },
-        pad=config.shift_pad,
+        {key: _encoder(config, key, m, stack, options) for key, m in spec.modalities.items()},
+        spec.modalities,
+        config.shift_pad,
+        config.standardize,
     )
-    senses = {key: encoders.features[key] for key in (*images, *vectors)}
-    share = _share(config, tuple(senses))
+    senses = {key: encoders.features[key] for key in spec.senses}
+    share = _share(config, spec.senses)
     critic_fusion = _fusion(config, encoders.features, share)
     actor_fusion = None
     if config.fusion == "decoupled":
@@ -139,53 +144,53 @@ def make_networks(
     return networks
 
 
-def modalities(config: AgentConfig, space: spaces.Dict) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the image keys and the vector keys that the actor uses, checked against the space.
+def observation_spec(config: ObservationConfig, space: spaces.Dict, stack: int) -> ObservationSpec:
+    """Return what the agent observes, checked against the space.
+
+    Args:
+        config: config of the agent.
+        space: observation space of the environment.
+        stack: number of frames in a stack.
 
     Raises:
-        MerlError: a named key is missing, or no key is left; the message gives the way out.
+        MerlError: a named key is missing, or the actor has no key; the message gives the way out.
     """
-    images = _keys("images", config.images, [k for k, s in space.items() if is_image(s)])
-    given = [k for k, s in space.items() if is_vector(s)]
-    actors = [key for key in given if key not in config.privileged]
-    vectors = _keys("vectors", config.vectors, given, default=actors)
-    if not images and not vectors:
-        if config.vectors == () and config.images == ():
-            hint = "name some with --agent.images or --agent.vectors"
-        elif config.vectors == ():
-            others = "merl_state, ddpg or sac" if given == ["state"] else "proprio"
-            hint = f"add an image, a uint8 Box (H, W, C), or use --agent {others}"
-        elif given:
-            hint = "--agent.privileged leaves no vector for the actor"
-        elif config.images == ():
-            hint = "add a vector, a float Box (n,), or use --agent drqv2"
-        else:
-            hint = "an image is a uint8 Box (H, W, C), a vector is a float Box (n,)"
-        raise MerlError(f"the agent can use no observation among {sorted(space)}: {hint}")
-    return images, vectors
-
-
-def privileged_keys(config: AgentConfig, space: spaces.Dict) -> tuple[str, ...]:
-    """Return the vector keys that only the critic observes.
-
-    Raises:
-        MerlError: a key is missing, the actor uses it too, or the fusion is shared.
-    """
-    given = [k for k, s in space.items() if is_vector(s)]
-    keys = _keys("privileged", config.privileged, given)
-    _, vectors = modalities(config, space)
-    for key in keys:
-        if key in vectors:
+    given = modalities_of(space)
+    privileged = _named("privileged", config.privileged, given)
+    keys = config.keys
+    if keys is None:
+        keys = tuple(
+            key for key, m in given.items() if m.kind in config.modalities and key not in privileged
+        )
+    for key in _named("keys", keys, given):
+        if key in privileged:
             raise MerlError(
                 f"agent.privileged names {key!r}, which the actor uses too: remove it from "
-                "--agent.privileged or from --agent.vectors"
+                "--agent.privileged or from --agent.keys"
             )
-    if keys and config.fusion != "decoupled":
-        raise MerlError(
-            f"agent.privileged {keys} needs separate fusions for critic and actor: use "
-            f"--agent.fusion decoupled instead of {config.fusion}"
-        )
-    return keys
+    if not keys:
+        raise MerlError(_nothing_to_use(config, space, given))
+    used = {key: m for key, m in given.items() if key in keys}
+    used |= {key: given[key] for key in privileged}
+    return ObservationSpec(used, privileged, stack)
+
+
+def _nothing_to_use(
+    config: ObservationConfig, space: spaces.Dict, given: Mapping[str, Modality]
+) -> str:
+    """Return an error message for an actor without keys."""
+    what = f"the agent can use no observation among {sorted(space)}"
+    if config.keys == ():
+        return f"{what}: name some with --agent.keys"
+    others = [key for key in given if key not in config.privileged]
+    if "state" in others:
+        return f"{what}: add --agent.keys state, or use --agent merl_state, ddpg or sac"
+    if others:
+        kinds = sorted({given[key].kind for key in others})
+        return f"{what}: add --agent.modalities {' '.join(kinds)}"
+    if given:
+        return f"{what}: --agent.privileged leaves no key for the actor"
+    return f"{what}: docs/howto/environment.md lists the boxes that agents can use"
 
 
 def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
@@ -203,10 +208,11 @@ def _share(config: AgentConfig, senses: tuple[str, ...]) -> int:
             f"agent.latent-dim {config.latent_dim} leaves {share} for each of {len(senses)} "
             f"modalities ({', '.join(senses)}): use at least {LEAST_SHARE * len(senses)}"
         )
-    if config.squash == "simnorm" and share % SIMNORM_GROUP:
+    group = GROUPS[config.fusion_layer]
+    if share % group:
         raise MerlError(
-            f"agent.squash simnorm needs a multiple of {SIMNORM_GROUP} per modality, not {share}: "
-            f"use agent.latent-dim {SIMNORM_GROUP * len(senses)} or a multiple"
+            f"agent.fusion-layer {config.fusion_layer} needs a multiple of {group} per modality, "
+            f"not {share}: use agent.latent-dim {group * len(senses)} or a multiple"
         )
     return share
 
@@ -223,48 +229,67 @@ def _fusion(config: AgentConfig, features: Mapping[str, int], share: int) -> Fus
     """Build a fusion with `share` numbers per modality; 0: a concatenation."""
     if share == 0:
         return Concatenation(features)
-    return Fusion(features, share, config.fusion_norm, config.squash)
+    return Fusion(features, share, config.fusion_norm, config.fusion_layer)
 
 
-def _image_encoder(
-    config: AgentConfig, key: str, space: spaces.Space[Any], stack: int
-) -> ConvEncoder:
-    assert isinstance(space, spaces.Box)
-    height, width, channels = space.shape
-    if config.shift_pad >= min(height, width):
+def _encoder(
+    config: AgentConfig, key: str, modality: Modality, stack: int, options: EncoderOptions
+) -> nn.Module:
+    """Build the encoder of a key; weights from a file are loaded by `load_encoder_weights`."""
+    if modality.stacked and config.shift_pad >= min(modality.shape[:2]):
+        height, width = modality.shape[:2]
         raise MerlError(
             f"agent.shift-pad {config.shift_pad} is too large for an image of {height}x{width} "
             f"pixels: use at most {min(height, width) - 1}"
         )
     try:
-        return ConvEncoder(
-            stack * channels,
-            (height, width),
-            config.conv_channels,
-            config.conv_strides,
-            (int(space.low.min()), int(space.high.max())),
-        )
+        return make_encoder(
+            config.encoders.get(key, modality.encoder), modality, stack, options
+        ).requires_grad_(key not in config.frozen_encoders)
     except MerlError as error:
         raise MerlError(f"observation {key!r}: {error}") from None
 
 
-def _vector_encoder(config: AgentConfig, space: spaces.Space[Any]) -> VectorEncoder:
-    assert space.shape is not None
-    return VectorEncoder(space.shape[0], config.vector_encoder_dim, config.standardize)
+def own_encoders(config: ObservationConfig) -> tuple[str, ...]:
+    """Return the encoders that a config names as `module:Class`."""
+    if not isinstance(config, AgentConfig):
+        return ()
+    return tuple(name for name in config.encoders.values() if ":" in name)
 
 
-def _keys(
-    kind: str, chosen: tuple[str, ...] | None, given: list[str], default: list[str] | None = None
-) -> tuple[str, ...]:
-    if chosen is None:
-        return tuple(given if default is None else default)
-    for key in chosen:
-        if chosen.count(key) > 1:
-            raise MerlError(f"agent.{kind} names {key!r} twice: name it once")
-        if key not in given:
-            there = f"gives {given}" if given else f"gives no {kind.split('-')[-1]}"
+def load_encoder_weights(networks: Networks, config: AgentConfig, home: Path) -> None:
+    """Load the weights that the config names into the encoders of a new agent.
+
+    Args:
+        networks: networks of the agent.
+        config: config of the agent.
+        home: the folder to which the names of the files are relative.
+
+    Raises:
+        MerlError: a file cannot be read, or the encoder is not a model of timm.
+    """
+    for key, file in config.encoder_weights.items():
+        encoder = networks.encoders.by_key[module_name(key)]
+        if not isinstance(encoder, TimmEncoder):
             raise MerlError(
-                f"agent.{kind} names {key!r}, but the environment {there}: name an existing key "
-                f"with --agent.{kind}, or add {key!r} to the observation"
+                f"agent.encoder-weights names {key!r}, whose encoder is not a model of timm: name "
+                f"one with --agent.encoders.{key}, e.g. resnet18"
             )
-    return chosen
+        encoder.load(home / file)
+
+
+def _named(field: str, keys: tuple[str, ...], given: Mapping[str, Modality]) -> tuple[str, ...]:
+    """Return the keys that a field names, checked.
+
+    Raises:
+        MerlError: a key is named twice or does not exist.
+    """
+    for key in keys:
+        if keys.count(key) > 1:
+            raise MerlError(f"agent.{field} names {key!r} twice: name it once")
+        if key not in given:
+            raise MerlError(
+                f"agent.{field} names {key!r}, but the observation has {sorted(given)}: name an "
+                f"existing key, or add {key!r} to the observation"
+            )
+    return keys

@@ -9,17 +9,9 @@ import torch
 from torch import Tensor
 
 
-def adam(
-    parameters: Sequence[Tensor], rate: float | Tensor, *, capturable: bool
-) -> torch.optim.Adam:
-    """Make Adam for these parameters.
-
-    Args:
-        parameters: parameters to train.
-        rate: step size; a tensor on the device if it will change while a CUDA graph contains it.
-        capturable: whether a CUDA graph can contain its step.
-    """
-    return torch.optim.Adam(parameters, lr=rate, fused=True, capturable=capturable)
+def adam(parameters: Sequence[Tensor], step_size: float) -> torch.optim.Adam:
+    """Make Adam for these parameters; on a GPU, a CUDA graph can contain its step."""
+    return torch.optim.Adam(parameters, lr=step_size, fused=True, capturable=parameters[0].is_cuda)
 
 
 def step_optimizer(
@@ -31,13 +23,10 @@ def step_optimizer(
     optimizer.step()
 
 
-def set_step_size(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    """Set the step size."""
+def set_step_size(optimizer: torch.optim.Optimizer, step_size: float | Tensor) -> None:
+    """Set the step size: a number, or a scalar tensor on the device, which may change later."""
     for group in optimizer.param_groups:
-        if isinstance(group["lr"], Tensor):
-            group["lr"].fill_(rate)
-        else:
-            group["lr"] = rate
+        group["lr"] = step_size
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:

@@ -10,34 +10,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 import tyro
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG
-from merl.agents.networks import Networks
-from merl.agents.optimizers import load_optimizer, step_optimizer
-from merl.core import MerlError
+from merl.agents.config import Positive
+from merl.agents.ddpg import DDPG, DDPGConfig
+from merl.agents.optimizers import adam, load_optimizer, step_optimizer
+from merl.core import MerlError, UpdatePlan
+from merl.networks.heads import Actor, GaussianActor
 from merl.networks.settings import with_torch_settings
 
 
 @dataclass(frozen=True)
-class SACConfig(AgentConfig):
+class SACConfig(DDPGConfig):
     """SAC on the state, with a learnt temperature (Haarnoja et al. 2018b)."""
 
-    images: tuple[str, ...] | None = ()
-    """Image keys to use: none."""
-    vectors: tuple[str, ...] | None = ("state",)
-    """Vector keys to use."""
-    latent_dim: int = 0
-    """d, the length of the fused representation; 0: no fusion, the heads receive the state."""
-    head_norm: bool = False
-    """LayerNorm in the hidden layers of actor and critic."""
-    temperature: float = 1.0
+    temperature: Positive = 1.0
     """Initial value of alpha."""
     target_entropy: float | None = None
     """Target of the policy's entropy, in nats; if not set, minus the dimension of the action."""
@@ -54,42 +46,27 @@ class SACConfig(AgentConfig):
                 f"agent.critic-loss {self.critic_loss} needs bounded returns, but the entropy "
                 "term makes SAC's returns unbounded: use mse"
             )
-        if not 0 < self.temperature < math.inf:
-            raise MerlError(f"agent.temperature must be above 0, not {self.temperature}")
-        if self.target_entropy is not None and not math.isfinite(self.target_entropy):
-            raise MerlError(f"agent.target-entropy must be finite, not {self.target_entropy}")
 
 
 class SAC(DDPG):
-    """Soft actor-critic.
-
-    Args:
-        networks: networks with a `GaussianActor`.
-        config: how to learn.
-        seed: seed of the noise and the shifts.
-        device: see `DDPG`.
-        threads: see `DDPG`.
-    """
+    """Soft actor-critic, with a `GaussianActor`; the arguments are those of `DDPG`."""
 
     config: SACConfig
+    actor_class: ClassVar[type[Actor] | type[GaussianActor]] = GaussianActor
 
-    def __init__(
-        self,
-        networks: Networks,
-        config: SACConfig,
-        *,
-        seed: int,
-        device: torch.device,
-        threads: int | None = None,
-    ) -> None:
-        super().__init__(networks, config, seed=seed, device=device, threads=threads)
+    def __init__(self, config: SACConfig, *spaces: Any, **options: Any) -> None:
+        super().__init__(config, *spaces, **options)
         start = math.log(config.temperature)
-        self.log_alpha = torch.tensor(start, device=device, requires_grad=True)
-        self.alpha_optimizer = self._adam([self.log_alpha])
+        self.log_alpha = torch.tensor(start, device=self.device, requires_grad=True)
+        self.alpha_optimizer = adam([self.log_alpha], config.learning_rate)
+
+    def optimizers(self) -> list[torch.optim.Adam]:
+        """Return the optimizers, which all have the same step size."""
+        return [*super().optimizers(), self.alpha_optimizer]
 
     @with_torch_settings
     @torch.inference_mode()
-    def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
+    def act(self, observation: Mapping[str, Tensor], *, explore: bool, step: int) -> Tensor:
         """Return tanh(u), u ~ N(mu, sigma^2), to explore, else tanh(mu); see `DDPG.act`."""
         mean, log_std = self._policy(observation, averaged=not explore)
         if not explore:
@@ -125,7 +102,7 @@ class SAC(DDPG):
             "action_saturation": (torch.tanh(mean.detach()).abs() > 0.95).float().mean(),
         }
 
-    def epsilon(self, noise: Tensor) -> Tensor:
+    def epsilon(self, noise: Tensor, plan: UpdatePlan) -> Tensor:
         """Return the standard normal noise unchanged: the policy scales it."""
         return noise
 

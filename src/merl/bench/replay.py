@@ -7,6 +7,7 @@ the input of the networks. The images show an arm that moves at random.
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from merl.bench.measuring import Work, circumstances, seconds, shown, spread, ta
 from merl.core import FrameTransforms, MerlError, Transition
 from merl.core.resources import free_disk
 from merl.envs import make_env
-from merl.networks.augmentation import RandomShift, draw_shifts, to_input
-from merl.replay import EpisodeRing, ReplayConfig, replay_bytes
+from merl.modalities import Image
+from merl.networks.augmentation import RandomShift, draw_shifts
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 
 EPISODE, PAD, MILLION = 250, 4, 1_000_000
 RAW, COMPRESSED = "raw", "compressed (--replay.compress)"
@@ -42,7 +44,7 @@ def run(repeats: int = 15, steps: int = 10_000, batch_size: int = 256) -> dict[s
         Plain values, for raw and compressed: `sample_ms`; `ready_ms` (sampling and shifting);
         `input_ms` (sampling, shifting and the encoder's conversion to fp32, the input of the first
         convolution); `write_us`, for a step; each as `median`, `low` and `high`. Also
-        `picture_bytes`, the size of an image of this task; `gigabytes`, the space reserved for a
+        `image_bytes`, the size of an image of this task; `gigabytes`, the space reserved for a
         million steps; and the values of `circumstances`.
     """
     threads = torch.get_num_threads()
@@ -68,7 +70,7 @@ def table(result: dict[str, Any]) -> Table:
     rows.add_row("    target", *(f"{bar:g}" for bar in BARS_MS.values()))
     add("the same, converted to fp32 as by the encoder, ms", "input_ms")
     add("write a step, us", "write_us")
-    rows.add_row("an image, bytes", *(f"{result['picture_bytes'][s]:,.0f}" for s in BARS_MS))
+    rows.add_row("an image, bytes", *(f"{result['image_bytes'][s]:,.0f}" for s in BARS_MS))
     rows.add_row(
         "space for a million steps, GB", *(f"{result['gigabytes'][s]:.3g}" for s in BARS_GB)
     )
@@ -80,27 +82,25 @@ def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "batch_size": batch_size}
     result |= circumstances()
     space, actions, seen = _observations()
-    million = {
-        side: replay_bytes(ReplayConfig(compress=side == COMPRESSED), space, actions, MILLION) / 1e9
-        for side in BARS_GB
-    }
+    specs = {}
+    for side in BARS_MS:
+        config = ReplayConfig(capacity=steps, batch_size=batch_size, compress=side == COMPRESSED)
+        specs[side] = ReplaySpec.of(config, space, actions)
+    million = {side: replace(specs[side], capacity=MILLION).bytes / 1e9 for side in BARS_GB}
     with tempfile.TemporaryDirectory() as folder:
-        _check_room(Path(folder), space, actions, steps)
-        rings: dict[str, EpisodeRing] = {}
+        _check_room(Path(folder), sum(spec.bytes for spec in specs.values()))
+        replays: dict[str, ReplayBuffer] = {}
         writing, sizes = {}, {}
-        for side in BARS_MS:
-            config = ReplayConfig(
-                capacity=steps, batch_size=batch_size, compress=side == COMPRESSED
-            )
-            directory = Path(folder) / str(len(rings))
-            rings[side] = EpisodeRing(config, space, actions, directory=directory)
-            writing[side] = _fill(rings[side], seen, actions, steps)
+        for side, spec in specs.items():
+            directory = Path(folder) / str(len(replays))
+            replays[side] = ReplayBuffer(spec, directory)
+            writing[side] = _fill(replays[side], seen, actions, steps)
             sizes[side] = _mean_bytes(directory, space)
         taken = take_turns(
             {
                 (stage, side): work
-                for side, ring in rings.items()
-                for stage, work in _stages(ring, batch_size).items()
+                for side, replay in replays.items()
+                for stage, work in _stages(replay, batch_size).items()
             },
             repeats,
         )
@@ -110,21 +110,13 @@ def _run(repeats: int, steps: int, batch_size: int) -> dict[str, Any]:
         }
     return result | {
         "write_us": {side: spread(times) for side, times in writing.items()},
-        "picture_bytes": sizes,
+        "image_bytes": sizes,
         "gigabytes": million,
     }
 
 
-def _check_room(folder: Path, space: spaces.Dict, actions: spaces.Box, steps: int) -> None:
-    """Check that both replays fit into the folder for temporary files.
-
-    Raises:
-        MerlError: they do not.
-    """
-    need = sum(
-        replay_bytes(ReplayConfig(compress=side == COMPRESSED), space, actions, steps)
-        for side in BARS_MS
-    )
+def _check_room(folder: Path, need: int) -> None:
+    """Raise MerlError if `need` bytes do not fit into the folder for temporary files."""
     free = free_disk(folder)
     if need > free:
         raise MerlError(
@@ -153,18 +145,18 @@ def _observations() -> tuple[spaces.Dict, spaces.Box, list[dict[str, Any]]]:
 
 
 def _fill(
-    ring: EpisodeRing, seen: list[dict[str, Any]], actions: spaces.Box, steps: int
+    replay: ReplayBuffer, seen: list[dict[str, Any]], actions: spaces.Box, steps: int
 ) -> list[float]:
     """Write the observations repeatedly; return the microseconds per step of each episode."""
     action = actions.sample().astype(np.float32)
     taken: list[float] = []
     for begin in range(0, steps, EPISODE):
-        ring.begin(seen[begin % len(seen)])
+        replay.begin(seen[begin % len(seen)])
 
         def episode(begin: int = begin) -> None:
             for step in range(1, EPISODE + 1):
                 observation = seen[(begin + step) % len(seen)]
-                ring.add(Transition(action, 0.0, 1.0, observation, step == EPISODE))
+                replay.add(Transition(action, 0.0, 1.0, observation, step == EPISODE))
 
         taken.append(1e6 * seconds(episode) / EPISODE)
     return taken
@@ -172,26 +164,28 @@ def _fill(
 
 def _mean_bytes(directory: Path, space: spaces.Dict) -> float:
     """Return the mean size of an image in the replay folder, in bytes."""
-    spans = directory / "observation.image.span.bin"
-    if not spans.exists():
+    spans = list(directory.rglob("observation.image.span.bin"))
+    if not spans:
         return float(np.prod(space["image"].shape or ()))
-    lengths = np.fromfile(spans, "<i8").reshape(-1, 2)[:, 1]
+    lengths = np.fromfile(spans[0], "<i8").reshape(-1, 2)[:, 1]
     return float(lengths[lengths > 0].mean())
 
 
-def _stages(ring: EpisodeRing, batch_size: int) -> dict[str, Work]:
+def _stages(replay: ReplayBuffer, batch_size: int) -> dict[str, Work]:
     """Return {stage: function that makes a batch up to this stage}, for each of `STAGES`."""
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
 
     def sample(*copies: FrameTransforms) -> list[Tensor]:
-        batch = ring.sample(batch_size, rng, *copies)
+        batch = replay.sample(batch_size, rng, *copies)
         return [batch.observation["image"], batch.next_observation["image"]]
 
     def ready() -> list[Tensor]:
         shifts = (draw_shifts(batch_size, PAD, generator) for _ in range(2))
         return sample(*({"image": RandomShift(each, PAD)} for each in shifts))
 
+    image = Image(spaces.Box(0, 255, (84, 84, 3), np.uint8))
+
     def as_input() -> list[Tensor]:
-        return [to_input(stack, torch.float32) for stack in ready()]
+        return [image.centred(stack, torch.float32) for stack in ready()]
 
     return dict(zip(STAGES, (sample, ready, as_input), strict=True))

@@ -16,20 +16,22 @@ from typing import Any
 import torch
 from rich.table import Table
 
+from merl.accelerate.networks import speed_up
 from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack
-from merl.acting.run_env import make_run_env, run_spaces
+from merl.acting.run_env import make_run_env, run_spaces, run_spec
 from merl.acting.workers import WorkerEnvs
 from merl.agents import make_agent
+from merl.agents.config import AgentConfig
 from merl.bench.measuring import Side, circumstances, shown, spread
 from merl.config import TrainConfig
-from merl.core import counted, is_image
+from merl.core import counted
 from merl.core.resources import keep_freed_memory
 from merl.experiments.presets import compose
-from merl.replay import ReplayBuffer
+from merl.replay import ReplayBuffer, ReplaySpec
 from merl.training.loop import Collector, Progress, Randomness, train
 from merl.training.setup import choose_device
-from merl.training.timing import measure, use_threads
+from merl.training.timing import measure
 from merl.training.updating import make_update
 
 STRICT = "strict: one environment, in turn with the learner"
@@ -63,6 +65,7 @@ def run(
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "task": task, "preset": preset}
     result |= circumstances()
     rates, config = steps_per_second(_sides(), task, preset, repeats, steps)
+    assert isinstance(config.agent, AgentConfig)
     result |= {
         "precision": config.agent.precision,
         "compiled": config.agent.torch_compile == "yes",
@@ -97,7 +100,7 @@ def steps_per_second(
         best = measure(config, env, env, space, choose_device(config.device)).best
         agent = best.decided(config.agent)
         config = dataclasses.replace(config, agent=agent, threads=best.threads)
-        use_threads(best.threads)
+        torch.set_num_threads(best.threads)
         keep_freed_memory()
         stack.callback(keep_freed_memory, False)
         loops = {
@@ -153,15 +156,25 @@ class _Loop:
         )
         stack.callback(environments.close)
         device, frames = choose_device(config.device), config.replay.frame_stack
-        images = tuple(key for key in space if is_image(space[key]))
         count = environments.count
-        replay = ReplayBuffer(config.replay, space, actions, count=count, capacity=CAPACITY)
-        stacks = [FrameStack(frames, images, device) for _ in range(count)]
-        agent = make_agent(config.agent, space, actions, frame_stack=frames, seed=0, device=device)
+        spec = ReplaySpec.of(config.replay, space, actions, capacity=CAPACITY, rings=count)
+        replay = ReplayBuffer(spec)
+        modalities = run_spec(config, env).modalities
+        stacks = [FrameStack(modalities, frames, device) for _ in range(count)]
+        agent = make_agent(
+            config.agent_name,
+            config.agent,
+            space,
+            actions,
+            frame_stack=frames,
+            seed=0,
+            device=device,
+        )
+        speed_up(agent)
         self._progress = Progress()
         collector = Collector(environments, replay, stacks)
         randomness = Randomness(config.seed)
-        update = make_update(agent, replay, randomness, config, lambda _: None)
+        update = make_update(agent, replay, randomness, config, device, lambda _: None)
         self._results = train(collector, agent, update, self._progress, randomness, config)
 
     def rate(self, steps: int) -> float:

@@ -1,14 +1,17 @@
-"""Speed of an update compared with the same update in plain PyTorch (`merl.bench.plain`).
+"""Speed of an update compared with the same update in plain PyTorch, `examples/merl_minimal.py`.
 
 Both have the same work: 84x84 images, three frames, proprioception of size 24, actions of size 9,
-batch 256; MERL with heads of six layers, as in the paper for `move_box` and `lift_box`, and DrQ-v2.
+batch 256, and heads of six layers, as in the paper for `move_box` and `lift_box`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any, Literal
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -17,25 +20,27 @@ from gymnasium import spaces
 from rich.table import Table
 from torch import Tensor
 
+from merl.accelerate.device_replay import DeviceReplay
+from merl.accelerate.networks import speed_up
+from merl.accelerate.recording import Recorded, UpdateOnDevice
 from merl.agents import AGENTS, make_agent
+from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.bench.measuring import Work, circumstances, shown, spread, take_turns
-from merl.bench.plain import Encoder, Plain, Sample
 from merl.core import Batch, MerlError, Transition, counted
-from merl.replay import EpisodeRing, ReplayConfig
-from merl.replay.on_device import OnDevice
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.training.setup import choose_device
 from merl.training.timing import Arithmetic
-from merl.training.updating import Recorded, UpdateOnDevice
 
+if TYPE_CHECKING:
+    from merl_minimal import MERL
+
+Precision = Literal["fp32", "bf16"]
 SIDE, STACK, PROPRIO, ACTIONS, LAYERS = 84, 3, 24, 9, 6
-REFERENCE, OURS, DRQV2, OUR_DRQV2, SB3 = (
-    "reference, MERL, fp32",
-    "merl, MERL",
-    "reference, pixels only (DrQ-v2), fp32",
-    "merl, DrQ-v2",
-    "Stable-Baselines3 TD3",
-)
+STRIDES, HIDDEN = (2, 1, 1, 1), (1024,) * (LAYERS - 1)
+REFERENCE, OURS, SB3 = "reference, fp32", "merl", "Stable-Baselines3 TD3"
+EXAMPLE = "merl_minimal.py"
+"""File of the reference: in a wheel beside this file, in the repository in `examples`."""
 SB3_DIFFERS = (
     "not the same update: no random shift, no 3-step returns for Dict observations, no LayerNorm, "
     "no fusion; its target averages the encoder too, and it samples from its buffer"
@@ -61,9 +66,9 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
         batch_size: B.
 
     Returns:
-        Plain values: `updates_per_s` by variant and `ratio` (to the reference of the same agent,
-        within each round), each as `median`, `low` and `high` over the rounds; `skipped` and
-        `not_compiled`, the reasons why a variant is missing; the values of `circumstances`.
+        Plain values: `updates_per_s` by variant and `ratio` (to the reference, within each round),
+        each as `median`, `low` and `high` over the rounds; `skipped` and `not_compiled`, the
+        reasons why a variant is missing; the values of `circumstances`.
     """
     device = choose_device("auto")
     on_gpu = device.type == "cuda"
@@ -80,45 +85,39 @@ def run(repeats: int = 5, batch_size: int = 256) -> dict[str, Any]:
 
     result: dict[str, Any] = {"repeats": repeats, "batch_size": batch_size} | circumstances()
     batch = noise_batch(batch_size).to(device)
-    replay = OnDevice([noise_replay()], device) if on_gpu else None
-    sides: dict[str, Work] = {}
-    of: dict[str, str] = {}
-    for reference, ours, agent in ((REFERENCE, OURS, "merl"), (DRQV2, OUR_DRQV2, "drqv2")):
-        plain, sample = reference_of(agent), as_sample(batch, vector=agent == "merl")
-        plain = plain.to(device)
-        sides[reference] = repeated(partial(plain.update, sample))
-        for precision in ("fp32", "bf16"):
-            name, learner = f"{ours}, {precision}", learner_of(agent, precision, device)
-            sides[name] = repeated(partial(learner.update, batch))
-            of[name] = reference
-            if replay is None:
-                continue
-            # A failed recording may break torch's generators: a recording that works follows it.
-            for compiled in (True, False) if precision == "bf16" else (False,):
-                whole = f"{name}{WHOLE}{COMPILED if compiled else ''}"
-                learner = learner_of(agent, precision, device, compiled=compiled)
-                update = UpdateOnDevice(learner, replay, batch_size, seed=0)
-                try:
-                    for _ in range(Recorded.WARM_UP + 1):
-                        update()
-                except Exception as error:
-                    if not compiled:
-                        raise
-                    result["not_compiled"] = f"{whole}: {type(error).__name__}"
-                    continue
-                sides[whole], of[whole] = repeated(update), reference
+    sides: dict[str, Work] = {
+        REFERENCE: repeated(partial(reference().to(device).update, as_sample(batch)))
+    }
+    for precision in ("fp32", "bf16"):
+        learner = learner_of("merl", precision, device)
+        sides[f"{OURS}, {precision}"] = repeated(partial(learner.update, batch, step=0))
+    if on_gpu:
+        replay = DeviceReplay(noise_replay(), device)
+        # A failed recording may break torch's generators: a recording that works follows it.
+        variants: tuple[tuple[Precision, bool], ...]
+        variants = ("fp32", False), ("bf16", True), ("bf16", False)
+        for precision, compiled in variants:
+            whole = f"{OURS}, {precision}{WHOLE}{COMPILED if compiled else ''}"
+            try:
+                learner = learner_of("merl", precision, device, compiled=compiled)
+                sides[whole] = repeated(_recorded(learner, replay, batch_size))
+            except Exception as error:
+                if not compiled:
+                    raise
+                result["not_compiled"] = f"{whole}: {type(error).__name__}"
     try:
         sides[SB3] = repeated(_stable_baselines(batch_size, device))
-        of[SB3], result["stable_baselines"] = REFERENCE, SB3_DIFFERS
+        result["stable_baselines"] = SB3_DIFFERS
     except MerlError as reason:
         result["skipped"] = f"{SB3}: {reason}"
-    taken = take_turns(sides, repeats, others=(REFERENCE, DRQV2, SB3))
+    taken = take_turns(sides, repeats, others=(REFERENCE, SB3))
     result["updates_per_s"] = {
         side: spread([times / t for t in each]) for side, each in taken.items()
     }
     result["ratio"] = {
-        side: spread([theirs / t for theirs, t in zip(taken[reference], taken[side], strict=True)])
-        for side, reference in of.items()
+        side: spread([theirs / t for theirs, t in zip(taken[REFERENCE], each, strict=True)])
+        for side, each in taken.items()
+        if side != REFERENCE
     }
     return result
 
@@ -142,61 +141,74 @@ def table(result: dict[str, Any]) -> Table:
     return rows
 
 
-def reference_of(agent: str) -> Plain:
-    """Return the plain form of `merl` or `drqv2`, in the size that is timed."""
-    channels = 3 * STACK
-    if agent == "merl":
-        return Plain(channels, SIDE, PROPRIO, ACTIONS, layers=LAYERS)
-    return Plain(
-        channels,
-        SIDE,
-        0,
-        ACTIONS,
-        layers=3,
-        latent=50,
-        head_norm=False,
-        average_fusion=True,
+def _recorded(learner: DDPG, replay: DeviceReplay, batch_size: int) -> Work:
+    """Return an update with its batch sampled from a replay on the GPU, recorded as a graph."""
+    update = UpdateOnDevice(learner, replay, batch_size, seed=0)
+    for _ in range(Recorded.WARM_UP + 1):
+        update(0)
+    return partial(update, 0)
+
+
+def load_example(**constants: float) -> ModuleType:
+    """Load the reference's file, with other values for some of its constants."""
+    here = Path(__file__)
+    files = here.with_name(EXAMPLE), here.parents[3] / "examples" / EXAMPLE
+    spec = spec_from_file_location("merl_minimal", next(file for file in files if file.exists()))
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    vars(module).update(constants)
+    return module
+
+
+def reference() -> MERL:
+    """Return the reference in the size that is timed."""
+    agent: MERL = load_example(PAD=4).MERL(
+        (3 * STACK, SIDE, SIDE), PROPRIO, ACTIONS, STRIDES, HIDDEN
     )
+    return agent
 
 
-def as_sample(batch: Batch, *, vector: bool) -> Sample:
-    """Convert a batch of the replay to the plain form: frames stacked as channels."""
+def as_sample(batch: Batch) -> list[Tensor]:
+    """Convert a batch of the replay to the reference's form: frames stacked as channels."""
 
-    def stacked(images: Tensor) -> Tensor:  # (B, K, H, W, C) to (B, K C, H, W)
-        return images.permute(0, 1, 4, 2, 3).flatten(1, 2).contiguous()
+    def parts(seen: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        images = seen["image"].permute(0, 1, 4, 2, 3)  # (B, K, H, W, C) to (B, K C, H, W)
+        return images.flatten(1, 2).contiguous(), seen["proprio"]
 
-    seen, then = batch.observation, batch.next_observation
-    return Sample(
-        stacked(seen["image"]),
-        seen["proprio"] if vector else seen["proprio"][:, :0],
-        batch.action,
-        batch.reward[:, None],
-        batch.discount[:, None],
-        stacked(then["image"]),
-        then["proprio"] if vector else then["proprio"][:, :0],
-    )
+    reward, discount = batch.reward[:, None], batch.discount[:, None]
+    given = *parts(batch.observation), batch.action, reward, discount
+    return [*given, *parts(batch.next_observation)]
 
 
 def learner_of(
     agent: str,
-    precision: Literal["fp32", "bf16"],
+    precision: Precision,
     device: torch.device,
     side: int = SIDE,
     *,
     compiled: bool = False,
 ) -> DDPG:
     """Return merl's agent in the size that is timed, for images of `side` x `side` pixels."""
-    config = Arithmetic(precision, torch.get_num_threads(), compiled).decided(AGENTS[agent])
+    arithmetic = Arithmetic(precision, torch.get_num_threads(), compiled)
+    config = arithmetic.decided(AGENTS[agent].config)
+    assert isinstance(config, AgentConfig)
     if agent == "merl":
         config = dataclasses.replace(config, head_layers=LAYERS)
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
-    return make_agent(config, space_of(side), actions, frame_stack=STACK, seed=0, device=device)
+    learner = make_agent(
+        agent, config, space_of(side), actions, frame_stack=STACK, seed=0, device=device
+    )
+    assert isinstance(learner, DDPG)
+    speed_up(learner)
+    return learner
 
 
-def noise_replay(steps: int = 2000) -> EpisodeRing:
+def noise_replay(steps: int = 2000) -> ReplayBuffer:
     """Return a replay filled with noise, in episodes of 250 steps."""
     actions = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
-    replay = EpisodeRing(ReplayConfig(), space_of(), actions, capacity=steps)
+    replay = ReplayBuffer(ReplaySpec.of(ReplayConfig(), space_of(), actions, capacity=steps))
     rng = np.random.default_rng(0)
     for step in range(steps):
         seen = {
@@ -253,12 +265,13 @@ def _stable_baselines(batch_size: int, device: torch.device) -> Work:
         """The encoded image and the proprioception, concatenated."""
 
         def __init__(self, observation_space: spaces.Dict) -> None:
-            encoder = Encoder(3 * STACK, SIDE)
-            super().__init__(observation_space, encoder.features + PROPRIO)
+            encoder = load_example().encoder(3 * STACK, STRIDES)
+            features = encoder(torch.zeros(1, 3 * STACK, SIDE, SIDE)).shape[1]
+            super().__init__(observation_space, features + PROPRIO)
             self.encoder = encoder
 
         def forward(self, observation: dict[str, Tensor]) -> Tensor:
-            encoded = self.encoder(observation["image"])
+            encoded = self.encoder(observation["image"] / 255 - 0.5)
             return torch.cat([encoded, observation["proprio"]], dim=-1)
 
     env = _Idle()

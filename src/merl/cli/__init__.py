@@ -1,9 +1,6 @@
 """The command line.
 
-Exit codes (docs/running.md): 0 success; 2 bad input, reported in one line; 3 a NaN or an infinity
-stopped the run; 4 an environment failed (a run that had begun is saved); 5 the run ended, but its
-last checkpoint or metrics could not be saved; 129, 130, 138 and 143 stopped by SIGHUP, Ctrl-C,
-SIGUSR1 or SIGTERM, and saved; 141 nothing reads the output of a command that only prints.
+docs/reference/exit_codes.md explains the exit codes.
 """
 
 from __future__ import annotations
@@ -16,7 +13,8 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -25,15 +23,16 @@ from merl.core import MerlError, suggest
 from merl.core.output import tolerant_output
 from merl.core.python_path import working_folder_hidden
 
-# A module is imported when its command runs: a misspelt command does not wait for torch.
 COMMANDS = {
-    "train": ("merl.cli.train", "train", "train an agent"),
-    "resume": ("merl.cli.resume", "resume", "resume a run"),
-    "evaluate": ("merl.cli.evaluate", "evaluate", "evaluate a trained policy, record a video"),
-    "tasks": ("merl.cli.tasks", "tasks", "list the tasks"),
-    "info": ("merl.cli.info", "info", "show versions, hardware and measured speed"),
-    "bench": ("merl.cli.bench", "bench", "compare merl's speed with a reference"),
+    "train": "train an agent on a task",
+    "resume": "continue a run that was stopped",
+    "evaluate": "run a trained policy, record a video",
+    "tasks": "list the tasks, with an image of each",
+    "info": "show versions, hardware and the expected speed",
+    "bench": "compare merl's speed with a reference",
 }
+"""The commands. Each is a module here, imported when its command runs: a misspelt command does not
+wait for torch. Its function has the command's name, its options are `TrainOptions` etc."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,14 +42,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     nonzero exit code.
     """
     args = list(sys.argv[1:] if arguments is None else arguments)
+    only_prints = args[:1] not in (["train"], ["resume"])
     try:
-        with tolerant_output() as (out, _), working_folder_hidden():
+        with tolerant_output() as (out, _), working_folder_hidden(), _warnings_on_stderr():
             code = _run(args)
     except SystemExit:  # tyro exits after it has printed the help
         if out.error is None:
             raise
-        code = 0
-    if code != 0 or out.error is None or (args[:1] in _TRAINING and not _asks_help(args)):
+        code, only_prints = 0, True
+    if code != 0 or out.error is None or not only_prints:
         return code
     if out.error.errno == errno.EPIPE:
         return 128 + signal.SIGPIPE
@@ -60,29 +60,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return MerlError.exit_code
 
 
-_TRAINING = (["train"], ["resume"])
-"""Commands that do more than print; lost output does not change their exit code."""
-
-
-def _asks_help(args: Sequence[str]) -> bool:
-    return "-h" in args or "--help" in args
-
-
 def _run(args: list[str]) -> int:
-    warnings.showwarning = _show_warning
-    logging.basicConfig(format="merl: %(levelname)s: %(message)s", level=logging.WARNING)
-    logging.addLevelName(logging.WARNING, "warning")
+    command, *rest = args or ["--help"]
     try:
-        if not args or args[0] in ("-h", "--help"):
+        if command in ("-h", "--help"):
             print(_usage())
             return 0
-        if args[0] == "--version":
+        if command == "--version":
             print(f"merl {merl.__version__}")
             return 0
-        if args[0] not in COMMANDS:
-            raise MerlError(f"command {args[0]!r} is unknown: {suggest(args[0], COMMANDS)}")
-        module, name, _ = COMMANDS[args[0]]
-        code: int = getattr(import_module(module), name)(args[1:])
+        if command == "--tyro-print-completion":
+            import_module("merl.cli.completion").print_completion(rest)
+            return 0
+        if command not in COMMANDS:
+            raise MerlError(f"command {command!r} is unknown: {suggest(command, COMMANDS)}")
+        code: int = getattr(import_module(f"merl.cli.{command}"), command)(rest)
         return code
     except MerlError as error:
         if os.environ.get("MERL_TRACEBACK"):
@@ -93,17 +85,42 @@ def _run(args: list[str]) -> int:
         return 128 + getattr(stop, "number", signal.SIGINT)
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """Print a warning in one line, without its source location; skip DeprecationWarning."""
-    if issubclass(category, DeprecationWarning):
-        return
-    text = " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(message)).split())  # without terminal colours
-    if text:
-        print(f"merl: warning: {text}", file=sys.stderr)
+@contextmanager
+def _warnings_on_stderr() -> Iterator[None]:
+    """Print each logged or issued warning in one line."""
+    handler, root = _OneLine(logging.WARNING), logging.getLogger()
+    root.addHandler(handler)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _log_warning
+            yield
+    finally:
+        root.removeHandler(handler)
+
+
+class _OneLine(logging.Handler):
+    """A handler that prints each message in one line, without terminal colours."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = " ".join(re.sub(r"\x1b\[[\d;]*m", "", record.getMessage()).split())
+        if text:
+            print(f"merl: {record.levelname.lower()}: {text}", file=sys.stderr)
+
+
+def _log_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if not issubclass(category, DeprecationWarning):
+        logging.getLogger(__name__).warning("%s", message)
 
 
 def _usage() -> str:
-    lines = [f"  {name:<10}{about}" for name, (_, _, about) in COMMANDS.items()]
+    commands = [f"  {name:<10}{about}" for name, about in COMMANDS.items()]
     return "\n".join(
-        ["usage: merl COMMAND ...", "", *lines, "", "merl COMMAND --help shows its options."]
+        [
+            "usage: merl COMMAND ...",
+            "",
+            *commands,
+            "",
+            "merl COMMAND --help shows its options, merl --version the version.",
+            "A first run, in under a minute: merl train reach_duplo --preset smoke",
+        ]
     )

@@ -2,38 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from merl.bench import BENCHES
 from merl.cli.output import make_console
 from merl.cli.parsing import check_writable, parse, write_json
-from merl.core import MerlError, suggest
+from merl.core import check_choice
+from merl.core.fields import Range, check_fields
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Time variants of the same work in turns; print medians and ranges."""
+
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(BENCHES))]
+    """What to time."""
+    repeats: Annotated[int, Range(1)] = 5
+    """How often each variant is timed."""
+    json: Path | None = None
+    """Also write the numbers to this file."""
+
+    def __post_init__(self) -> None:
+        check_choice("bench", self.name, tuple(BENCHES))
+        check_fields(self, "--")
 
 
 def bench(args: list[str]) -> int:
     """Time merl and a reference, and print a table: merl bench env."""
-    if not args or args[0] in ("-h", "--help"):
-        print(f"usage: merl bench {{{','.join(BENCHES)}}} [--repeats N] [--json FILE]")
-        return 0
-    if args[0] not in BENCHES:
-        raise MerlError(f"bench {args[0]!r} is unknown: {suggest(args[0], BENCHES)}")
-
-    def command(repeats: int = 5, json: Path | None = None) -> tuple[int, Path | None]:
-        """Time variants of the same work in turns; print medians and ranges.
-
-        Args:
-            repeats: How often each variant is timed.
-            json: Also write the numbers to this file.
-        """
-        return repeats, json
-
-    repeats, output = parse(command, f"merl bench {args[0]}", args[1:])
-    if repeats < 1:
-        raise MerlError(f"--repeats must be at least 1, not {repeats}")
-    check_writable(output)
-    run, show = BENCHES[args[0]]
-    result = run(repeats=repeats)
+    options = parse(BenchOptions, "merl bench", args)
+    check_writable(options.json)
+    run, show = BENCHES[options.name]
+    result = run(repeats=options.repeats)
     make_console().print(show(result))
-    if output is not None:
-        write_json(output, result)
+    if options.json is not None:
+        write_json(options.json, result)
     return 0

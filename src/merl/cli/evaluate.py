@@ -13,6 +13,7 @@ from merl.cli.parsing import check_writable, parse, write_json
 from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
 from merl.core import MerlError
+from merl.core.fields import Range, check_fields
 from merl.envs.config import RendererName
 from merl.evaluation.evaluation import EVALUATION_SEED
 from merl.evaluation.policy import load_policy
@@ -27,11 +28,11 @@ class EvaluateOptions:
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
-    episodes: int = 10
+    episodes: Annotated[int, Range(1)] = 10
     """Number of episodes."""
     video: Path | None = None
     """Record a video of the first episode in this file (MP4)."""
-    max_episode_steps: int | None = None
+    max_episode_steps: Annotated[int, Range(1)] | None = None
     """Steps after which an episode is cut off; by default the run's --eval.max-episode-steps."""
     checkpoint: str = "latest"
     """latest, best (the highest evaluation return), or the step of a checkpoint."""
@@ -44,10 +45,7 @@ class EvaluateOptions:
     """Also write the seed, return and success of each episode to this file."""
 
     def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise MerlError(f"--episodes must be at least 1, not {self.episodes}")
-        if self.max_episode_steps is not None and self.max_episode_steps < 1:
-            raise MerlError(f"--max-episode-steps must be at least 1, not {self.max_episode_steps}")
+        check_fields(self, "--")
         if self.video is not None and self.video.suffix.lower() not in ("", ".mp4"):
             raise MerlError(
                 f"--video {self.video}: videos are MP4; use {self.video.with_suffix('.mp4')}"
@@ -61,9 +59,9 @@ def evaluate(args: list[str]) -> int:
     # Resolve paths before user code runs: it may change the working folder.
     json_file, video_file = _absolute(options.json), _absolute(options.video)
     console = make_console()
-    policy = load_policy(options.run, checkpoint=options.checkpoint)
     if options.trust:
         tell_trusted(Run.open(options.run))
+    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
     result = policy.evaluate(
         episodes=options.episodes,
         video=video_file,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.table import Table
@@ -22,13 +23,14 @@ FEATURES = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
 """Processor features that determine the speed of an update, by their names in Linux."""
 
 
+@dataclass(frozen=True)
+class InfoOptions:
+    """Show versions, hardware and measured speed (takes half a minute)."""
+
+
 def info(args: list[str]) -> int:
     """Print versions, processor, GPU, memory, renderer speeds and the expected training speed."""
-
-    def command() -> None:
-        """Show versions, hardware and measured speed (takes half a minute)."""
-
-    parse(command, "merl info", args)
+    parse(InfoOptions, "merl info", args)
     console = make_console()
     table = Table(show_header=False, box=None, padding=(0, 2))
     with console.status("measuring", spinner="line"):

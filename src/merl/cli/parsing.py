@@ -2,98 +2,107 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
+import dataclasses
 import json
 import os
-import re
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import tyro
+from tyro import _errors  # no public hook for errors yet: pyproject.toml pins the version
 
-from merl.core import MerlError
+from merl.core import MerlError, suggest
 
 T = TypeVar("T")
 
 
-def parse(target: Callable[..., T], prog: str, args: list[str], **options: Any) -> T:
+def parse(
+    options: type[T],
+    prog: str,
+    args: list[str],
+    default: T | None = None,
+    *,
+    rest: list[str] | None = None,
+) -> T:
     """Parse arguments with tyro.
 
     Args:
-        target: the class or function that the flags are made from.
+        options: the dataclass that the flags are made from.
         prog: the name of the command, for help and errors.
         args: the arguments after the command's name.
-        options: further arguments of `tyro.cli`.
+        default: an instance with the default values.
+        rest: gets the arguments that belong to other options; None: there must be none.
 
     Raises:
         MerlError: the arguments are invalid; the message is one line.
     """
-    try:
-        return _parsed(target, prog, args, options)
-    except MerlError as error:
-        # Tyro takes the argument after an unknown flag as its value and then misses that argument.
-        # With one argument more, tyro names the unknown flag.
-        if str(error).startswith("missing value for argument"):
-            try:
-                _parsed(target, prog, ["x", *args], options)
-            except MerlError as other:
-                if str(other).startswith("unrecognized"):
-                    raise other from None
-        raise
+
+    def fail(event: _errors.ParseErrorEvent) -> None:
+        if isinstance(event, _errors.BadValue) and event.argument.is_positional():
+            # An option that tyro does not know stands where this argument is expected: with
+            # something in its place, tyro names the option.
+            parse(options, prog, ["-", *args], default)
+        message = _message(event, options if default is None else default)
+        if message is not None:
+            raise MerlError(message) from None
+
+    with _errors.on_parse_error(fail):
+        if rest is not None:
+            found, others = tyro.cli(
+                options, prog=prog, args=args, add_help=False, return_unknown_args=True
+            )
+            rest += others
+            return found
+        given: Any = tyro.MISSING_NONPROP if default is None else default
+        parsed: T = tyro.cli(options, prog=prog, args=args, default=given)
+        return parsed
 
 
-def _parsed(target: Callable[..., T], prog: str, args: list[str], options: dict[str, Any]) -> T:
-    errors = io.StringIO()
-    columns = os.environ.get("COLUMNS")
-    asks_help = any(arg in ("-h", "--help") for arg in args)
-    try:
-        if not asks_help:
-            os.environ["COLUMNS"] = "1000"  # tyro must not wrap the message
-        with contextlib.redirect_stderr(errors):
-            parsed: T = tyro.cli(target, prog=prog, args=args, **options)
-            return parsed
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise MerlError(_one_line(errors.getvalue())) from None
-    finally:
-        if columns is None:
-            os.environ.pop("COLUMNS", None)
+def _message(event: _errors.ParseErrorEvent, options: Any) -> str | None:
+    """Return one line about an error; None leaves the message to tyro."""
+    match event:
+        case _errors.MissingArgs(unrecognized_tokens=tokens) if tokens:
+            return _unknown(tokens, event.prog, options)
+        case _errors.MissingArgs(missing_arguments=missing):
+            names = ", ".join(each.arg.lowered.metavar or "" for each in missing)
+            return f"missing from {event.prog}: {names}"
+        case _errors.UnrecognizedArgs(tokens=tokens):
+            return _unknown(tokens, event.prog, options)
+        case _errors.InvalidChoice(argument=argument, value=value, choices=choices):
+            known = [choice for choice in choices if choice != "None"]  # None: omit the flag
+            return f"{argument.display_name()} {value!r} is unknown: {suggest(value, known)}"
+        case _errors.BadValue(argument=argument):
+            return f"{argument.display_name()} needs a value: {argument.lowered.metavar}"
+        case _errors.InstantiationFailure(argument=argument, message=reason) if argument:
+            last = reason.splitlines()[-1]
+            last = last.partition(": ")[2] if last.startswith("- ") else last  # "- TYPE: REASON"
+            return f"{argument.display_name()} takes {argument.lowered.metavar}: {last}"
+    return None
+
+
+def _unknown(tokens: list[str], prog: str, options: Any) -> str:
+    named = [token for token in tokens if token.startswith("-")] or tokens
+    flag = named[0].partition("=")[0]
+    known = list(_flags(options))
+    hint = suggest(flag, known)
+    if hint.startswith("choose"):
+        hint = f"{prog} --help lists all options"
+    return f"unrecognized options: {', '.join(named)}: {hint}"
+
+
+def _flags(options: Any, prefix: str = "") -> Iterator[str]:
+    """Yield the flags that tyro makes from a dataclass or an instance of it."""
+    cls = options if isinstance(options, type) else type(options)
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        kind, *notes = get_args(hint) or (hint,)
+        inner = getattr(options, name, kind)
+        given = [note.name for note in notes if getattr(note, "name", None) is not None]
+        name = given[0] if given else name
+        if dataclasses.is_dataclass(kind):
+            yield from _flags(inner, f"{prefix}{name}." if name else prefix)
         else:
-            os.environ["COLUMNS"] = columns
-
-
-def _one_line(box: str) -> str:
-    """Return the message of tyro's framed error and the first flag that tyro suggests.
-
-    Horizontal rules divide the frame into parts. The title is in the frame's top line, or, on a
-    terminal with ASCII only, in its own part.
-    """
-    lines = [line.strip().strip("│|").strip() for line in box.splitlines()]
-    parts: list[list[str]] = [[]]
-    for line in lines:
-        if line.startswith("╭") or (line and not set(line) - set("─-")):
-            parts.append([])
-        elif line and not line.startswith("╰"):
-            parts[-1].append(line)
-    message = " ".join(parts[1]) if len(parts) > 1 else ""
-    if not message:
-        return " ".join(box.split())
-    message = message[0].lower() + message[1:]
-    message = re.sub(r"\('[^()]*'\)", _choices, message)
-    if "erhaps you meant" in box:
-        flags = [match for line in lines if (match := re.match(r"--\w[\w.-]*", line))]
-        if flags:
-            message += f": did you mean {flags[0].group()}?"
-    return message
-
-
-def _choices(listed: re.Match[str]) -> str:
-    """Return the choices in order, without None: None means that the flag is omitted."""
-    names = sorted(set(re.findall(r"'([^']*)'", listed.group())) - {"None"})
-    return f"({', '.join(map(repr, names))})"
+            yield f"--{prefix}{name}".replace("_", "-")
 
 
 def check_writable(path: Path | None) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from merl.cli.parsing import parse
 from merl.cli.running import go_on, tell_trusted
+from merl.config import Device
 from merl.runs.resume import resume_request
 from merl.runs.run import Run
 
@@ -24,18 +25,19 @@ class ResumeOptions:
     """Train to this total number of steps; by default to the run's own --steps."""
     minutes: float | None = None
     """Stop after this many minutes from now; by default there is no time limit."""
-    device: Literal["auto", "cpu", "cuda"] | None = None
+    device: Device | None = None
     """Where the networks live from now on; by default where they were before."""
     trust: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Import the environment that the run names, although you have not trained this run here. This
-    runs the code of the run's author."""
+    """Import the environment and the agent that the run names, although you have not trained this
+    run here. This runs the code of the run's author."""
 
 
 def resume(args: list[str]) -> int:
     """Resume a run: merl resume RUN [--steps N] [--minutes N]."""
     options = parse(ResumeOptions, "merl resume", args)
     run = Run.open(options.run)
-    asked = resume_request(run.config, options.steps, options.minutes, options.device)
     if options.trust:
         tell_trusted(run)
+    run = run.with_agent(trusted=options.trust)
+    asked = resume_request(run.config, options.steps, options.minutes, options.device)
     return go_on(run, asked, ["device"], trusted=options.trust)

@@ -15,8 +15,7 @@ from merl.cli.duration import duration
 from merl.cli.output import make_console
 from merl.cli.summary import summarize
 from merl.config import TrainConfig
-from merl.core import counted, is_image
-from merl.replay import replay_bytes
+from merl.core import counted
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
@@ -117,11 +116,9 @@ def _scale(config: TrainConfig) -> dict[str, float]:
 def _outlook(setup: Setup, what: str, done: int) -> str:
     """Return lines that describe the run: its duration, inputs, speed and memory."""
     config, timing = setup.config, setup.timing
-    size = replay_bytes(
-        config.replay, setup.space, setup.action_space, config.capacity, config.num_envs
-    )
+    size = decimal(setup.replay_spec.bytes)
     updates = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
-    has_images = not config.own_env and any(is_image(space) for space in setup.space.values())
+    has_images = not config.own_env and any(m.stacked for m in setup.spec.modalities.values())
     images = f" ({config.env.renderer} images)" if has_images else ""
     lines = [f"{what}: {duration(config, timing, done)}"]
     if timing.seconds(config, done) > DAY and config.preset != "laptop":
@@ -130,7 +127,7 @@ def _outlook(setup: Setup, what: str, done: int) -> str:
     step = "ms per step" if timing.knows_env else "ms per step, without the environment"
     lines += [
         f"an update takes {updates}; acting takes {1000 * timing.step:.1f} {step}{images}",
-        f"the replay takes {decimal(size)} for {counted(config.capacity, 'step')}",
+        f"the replay takes {size} for {counted(config.capacity, 'step')}",
     ]
     if timing.not_compiled is not None:
         lines.append(f"updates are not compiled because compiling fails: {timing.not_compiled}")

@@ -11,7 +11,7 @@ from rich.table import Table
 from merl.acting.run_env import make_run_env
 from merl.config import TrainConfig
 from merl.core import counted
-from merl.envs.wrappers import in_one_line
+from merl.core.user_code import in_one_line
 from merl.evaluation.evaluation import Act, Evaluation, evaluate
 from merl.report.references import RANDOM, Reference, references
 from merl.runs.run_folder import resume_line

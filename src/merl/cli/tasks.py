@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,18 +25,17 @@ START = 3
 """Seed of the start state that is shown, with arm and object in view."""
 
 
+@dataclass(frozen=True)
+class TasksOptions:
+    """List the tasks that come with merl, with an image of each."""
+
+    pictures: Path | None = None
+    """Also write the images to this folder, as PNG files."""
+
+
 def tasks(args: list[str]) -> int:
     """List the tasks, with an image of each."""
-
-    def command(pictures: Path | None = None) -> Path | None:
-        """List the tasks that come with merl, with an image of each.
-
-        Args:
-            pictures: Also write the images to this folder, as PNG files.
-        """
-        return pictures
-
-    folder = parse(command, "merl tasks", args)
+    folder = parse(TasksOptions, "merl tasks", args).pictures
     console = make_console()
     for name in TASKS:
         image = _image(name)

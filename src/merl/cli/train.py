@@ -4,82 +4,120 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, Any
 
 import tyro
 
+from merl.agents import AGENTS
+from merl.agents.config import ObservationConfig
 from merl.cli.parsing import parse
 from merl.cli.running import begin, go_on
-from merl.config import Setting, TrainConfig
+from merl.config import Setting, TrainConfig, flat
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import PRESETS, compose, default_preset
 from merl.runs.resume import decided, left_open
 from merl.runs.run import Run
+
+PROG = "merl train"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The options on which the defaults of all others depend."""
+
+    preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
+    """Set of default values for the other options: paper (Table 1, for a machine with CUDA), laptop
+    (2 cores without a GPU), state (from the simulator's state) or smoke (a test in a minute)."""
+    agent: Annotated[str | None, tyro.conf.arg(metavar="|".join([*AGENTS, "MODULE:CLASS"]))] = None
+    """Agent and the observations that it uses. merl: camera and joints; drqv2: camera; proprio:
+    joints; merl_state, ddpg, sac: state; module:Class: your own."""
+    setting: Setting = "matched"
+    """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
+    (published)."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
     """Train an agent on a task."""
 
+    choice: Annotated[Choice, tyro.conf.arg(name="")]
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Resume the run in --run-dir if there is one, else start it. A job that may be stopped at any
     time can be submitted again with the same command."""
 
 
+@dataclass(frozen=True)
+class _First(Choice):
+    """What is parsed first, before the defaults of the other options are known."""
+
+    help: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(aliases=["-h"])] = False
+
+
 def train(args: list[str]) -> int:
     """Train an agent: merl train TASK [--preset paper|laptop|state|smoke] [--steps N] ..."""
-    preset, why = _choose_preset(args)
-    agent = _given(args, "--agent")
-    setting = cast(Setting, _given(args, "--setting") or "matched")  # `compose` checks it
-    default = compose(preset, tyro.MISSING, agent, setting)
-    task = _parse(args, default).config.task
-    options = _parse(args, compose(preset, task, agent, setting))
-    config = options.config
-    if config.own_env and config.env != default.env:
-        changed = [
-            f"--{field.name.replace('_', '-')}"
-            for field in dataclasses.fields(config.env)
-            if getattr(config.env, field.name) != getattr(default.env, field.name)
-        ]
-        raise MerlError(
-            f"{', '.join(changed)} is for merl's own tasks: {config.task} defines its own "
-            "observations"
-        )
-    if not config.own_env and config.user_env != default.user_env:
-        raise MerlError(
-            "--env.image-layout and --env.allow-wide-actions are for your own environment: "
-            f"omit them for {config.task}"
-        )
-    if options.resume:
+    rest: list[str] = []
+    first = parse(_First, PROG, args, rest=rest)
+    preset = default_preset() if first.preset is None else first.preset
+    composed = partial(compose, preset, agent=first.agent, setting=first.setting)
+
+    def options(default: TrainConfig) -> TrainOptions:
+        choice = Choice(preset, default.agent_name, first.setting)
+        agent = dataclasses.replace(default.agent, **_by_key(rest, default.agent))
+        without_task = dataclasses.replace(default, task=tyro.MISSING, agent=agent)
+        return parse(TrainOptions, PROG, args, default=TrainOptions(choice, without_task))
+
+    default, given_open = composed("reach_duplo"), set[str]()
+    if not first.help:  # the help shows the defaults of a task of merl's own
+        closed = decided(default)
+        asked = options(closed).config
+        default, given_open = composed(asked.task), {*left_open(asked)} - {*left_open(closed)}
+    chosen = options(default)
+    config = chosen.config
+    _refuse_foreign(config, default)
+    if chosen.resume:
         if config.run_dir is None:
             raise MerlError("--resume needs --run-dir: name the folder of the run to resume")
         if (config.run_dir / CONFIG_FILE).exists():
-            closed = decided(compose(preset, task, agent, setting))
-            given_open = {*left_open(_parse(args, closed).config)} - {*left_open(closed)}
-            return go_on(Run.open(config.run_dir), config, given_open, named_in=Path.cwd())
-    return begin(config, f"preset {preset} ({why}; {PRESETS[preset].about})")
+            run = Run.open(config.run_dir)
+            if run.config.agent_name == config.agent_name:  # otherwise `go_on` refuses
+                run = run.with_agent(named_in=Path.cwd())
+            return go_on(run, config, given_open, named_in=Path.cwd())
+    why = "CUDA is available" if preset == "paper" else "CUDA is not available"
+    reason = why if first.preset is None else "as requested"
+    return begin(config, f"preset {preset} ({reason}; {PRESETS[preset].about})")
 
 
-def _parse(args: list[str], default: TrainConfig) -> TrainOptions:
-    return parse(TrainOptions, "merl train", args, default=TrainOptions(default))
+def _by_key(args: list[str], agent: ObservationConfig) -> dict[str, Any]:
+    """Return the agent's options for single keys, `--agent.encoders.KEY`, with empty values.
+
+    tyro makes a flag for each key of a default, and the user's environment defines the keys.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for field in ("encoders", "encoder_weights"):
+        start = f"--agent.{field.replace('_', '-')}."
+        keys = [arg.partition("=")[0].removeprefix(start) for arg in args if arg.startswith(start)]
+        if keys and hasattr(agent, field):
+            found[field] = dict.fromkeys(keys, "")
+    return found
 
 
-def _choose_preset(args: list[str]) -> tuple[str, str]:
-    """Return the preset's name and the reason for the choice."""
-    name = _given(args, "--preset")
-    if name is not None:
-        return name, "as requested"
-    name = default_preset()
-    return name, "CUDA is available" if name == "paper" else "CUDA is not available"
+def _refuse_foreign(config: TrainConfig, default: TrainConfig) -> None:
+    """Refuse options of merl's tasks for a user's environment, and the other way round.
 
-
-def _given(args: list[str], flag: str) -> str | None:
-    """Return the value of a flag, before all arguments are parsed; the last occurrence counts."""
-    for index, arg in reversed(list(enumerate(args))):
-        if arg == flag and index + 1 < len(args):
-            return args[index + 1]
-        if arg.startswith(f"{flag}="):
-            return arg.removeprefix(f"{flag}=")
-    return None
+    Raises:
+        MerlError: such an option differs from its default.
+    """
+    before = flat(default)
+    changed = [name for name, value in flat(config).items() if value != before[name]]
+    if config.own_env:
+        flags = [name.partition(".")[2] for name in changed if name.startswith("env.")]
+        whose = f"merl's own tasks: {config.task} defines its own observations"
+    else:
+        flags = [name.removeprefix("user_") for name in changed if name.startswith("user_env.")]
+        whose = f"your own environment: omit it for {config.task}"
+    if flags:
+        named = ", ".join(f"--{flag.replace('_', '-')}" for flag in flags)
+        raise MerlError(f"{named} is for {whose}")

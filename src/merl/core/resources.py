@@ -34,7 +34,7 @@ def keep_freed_memory(keep: bool = True) -> bool:
     Every update frees and allocates the same large blocks. By default glibc maps each block anew,
     and the system provides its pages one by one, filled with zeros. That costs a tenth of the
     processor time of an update of the paper's size, and more if other runs share the machine
-    (docs/bench.md).
+    (docs/explanation/benchmarks.md).
 
     Args:
         keep: False restores the values that glibc chooses after large blocks were freed.

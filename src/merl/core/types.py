@@ -9,19 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     import torch
-    from gymnasium import spaces
     from torch import Tensor
 
 Observation = Mapping[str, NDArray[Any]]
-"""The observation of one timestep, one key per modality: an image is uint8 (H, W, C), a vector
-float32 (n,). It holds single frames; acting and replay stack them."""
+"""The observation of one timestep: `merl.modalities` has the types and shapes. It holds single
+frames; acting and replay stack them."""
+
+Kind = Literal["image", "depth", "vector", "sequence"]
+"""Kinds of observations; `merl.modalities` has a class for each."""
 
 FrameTransform = Callable[[int, NDArray[np.uint8], NDArray[np.uint8]], None]
 """A function that copies a stack of frames from the replay into a batch, e.g. with a random shift.
@@ -33,17 +35,6 @@ CONFIG_FILE = "config.json"
 """File in a run folder that holds the config of the run."""
 METRICS_FILE = "metrics.csv"
 """File in a run folder that holds the metrics of the run."""
-
-
-def is_image(space: spaces.Space[Any]) -> bool:
-    """Return whether the space is that of an image: a uint8 box of shape (H, W, C)."""
-    return space.dtype == np.uint8 and space.shape is not None and len(space.shape) == 3
-
-
-def is_vector(space: spaces.Space[Any]) -> bool:
-    """Return whether the space is that of a vector: a float box of shape (n,)."""
-    floats = space.dtype is not None and np.issubdtype(space.dtype, np.floating)
-    return bool(floats) and space.shape is not None and len(space.shape) == 1
 
 
 @dataclass(frozen=True)
@@ -70,8 +61,9 @@ class Batch:
     """The input of one update: B samples of (o_t, a_t, r_{t:t+n-1}, o_{t+n}).
 
     Attributes:
-        observation: o_t; images uint8 (B, K, H, W, C) with the oldest of the K stacked frames
-            first, vectors float32 (B, n).
+        observation: o_t, as stored (`merl.modalities`): stacked frames (B, K, H, W, C) with the
+            oldest of the K first, images uint8 and depth int16; vectors float32 (B, n), histories
+            float32 (B, T, n).
         action: a_t, float32 (B, A), in [-1, 1].
         reward: sum of gamma^i r_{t+i} for i < m, float32 (B,); m = n, or less if the episode ends
             earlier.
@@ -98,37 +90,116 @@ class Batch:
         )
 
 
+@dataclass(frozen=True)
+class UpdateNoise:
+    """The random numbers of one update, as a value that a second implementation can use too.
+
+    Attributes:
+        shifts: crop offsets of o_t by key, int64 (B, 2); empty if frames are shifted already.
+        next_shifts: crop offsets of o_{t+n}, in the same form.
+        next_noise: epsilon of the target's action, (B, A): scaled and clipped; in SAC standard
+            normal.
+        actor_noise: epsilon of the actor's action, in the same form.
+    """
+
+    shifts: dict[str, Tensor]
+    next_shifts: dict[str, Tensor]
+    next_noise: Tensor
+    actor_noise: Tensor
+
+
+class UpdatePlan(NamedTuple):
+    """What an update depends on besides weights, batch and noise.
+
+    The numbers change with the step. They are scalar tensors on the device where the update is
+    recorded once and then repeated.
+    """
+
+    trains_actor: bool
+    """Whether the update includes the actor."""
+    noise_std: float | Tensor
+    """Standard deviation of the action noise in the update."""
+    step_size: float | Tensor
+    """Step size of the optimizers."""
+
+
+@runtime_checkable
 class Agent(Protocol):
     """Interface of an agent: everything that acting, training, evaluation and saving use.
 
-    Attributes:
-        step: environment steps so far; the training loop sets it, and exploration may depend on it.
+    docs/howto/agent.md shows how to add one.
     """
-
-    step: int
 
     @property
     def senses(self) -> tuple[str, ...]:
         """Return the observation keys that the policy uses."""
         ...
 
-    def act(self, observation: Mapping[str, Tensor], *, explore: bool) -> Tensor:
+    def act(self, observation: Mapping[str, Tensor], *, explore: bool, step: int) -> Tensor:
         """Return actions (B, A) in [-1, 1] for stacked observations.
 
         Args:
-            observation: images uint8 (B, K, H, W, C), vectors float32 (B, n).
+            observation: as in `Batch`, on the device.
             explore: whether to add exploration noise.
+            step: environment steps so far, on which the noise may depend.
         """
         ...
 
-    def update(self, batch: Batch) -> dict[str, Tensor]:
-        """Make one gradient step on every network; return metrics as scalars on the device."""
+    def update(self, batch: Batch, noise: Any = None, *, step: int) -> dict[str, Tensor]:
+        """Learn from a batch; return metrics as scalars on the device.
+
+        Args:
+            batch: the samples; may be on another device.
+            noise: random numbers of the update, in the agent's own form; None (as in training): the
+                agent draws them. For comparison with a second implementation.
+            step: environment steps so far, on which schedules may depend.
+        """
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all state that updates depend on: weights, optimizers, random generators."""
+        """Return all state that updates depend on: weights, optimizers, random generators.
+
+        Dicts of tensors by name, e.g. `network.state_dict()`, are saved as weights; the rest may
+        hold tensors and plain values.
+        """
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore from `state_dict()`."""
+        ...
+
+    def load_policy(self, weights: Mapping[str, Mapping[str, Tensor]]) -> None:
+        """Restore what `act` needs, for deployment, from the dicts of tensors in `state_dict()`."""
+        ...
+
+
+@runtime_checkable
+class Accelerable(Agent, Protocol):
+    """An agent whose `update` is plan, draw and learn, which training can make faster.
+
+    On a CPU, images are shifted while they are copied from the replay. On a GPU, draw and learn are
+    recorded as a CUDA graph: their operations depend only on `UpdatePlan.trains_actor`.
+
+    Attributes:
+        device: device of the agent.
+        learning: random generator of `draw`.
+    """
+
+    device: torch.device
+    learning: torch.Generator
+
+    def plan(self, step: int) -> UpdatePlan:
+        """Begin an update: count it, and return its plan."""
+        ...
+
+    def draw(self, size: int, plan: UpdatePlan) -> UpdateNoise:
+        """Draw the random numbers of an update with a batch of `size` samples."""
+        ...
+
+    def frame_transforms(self, noise: UpdateNoise) -> tuple[FrameTransforms, FrameTransforms]:
+        """Return the shifts of o_t and of o_{t+n} as transforms that the replay applies."""
+        ...
+
+    def learn(self, batch: Batch, noise: UpdateNoise, plan: UpdatePlan) -> dict[str, Tensor]:
+        """Make the update, with a batch on the device; return metrics as scalars there."""
         ...

@@ -3,32 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
-from merl.core import MerlError, check_choice
+from merl.core import Kind, MerlError
+from merl.core.fields import NOT_EMPTY, Range, check_fields
 
 RendererName = Literal["gl", "raster"]
 RendererChoice = Literal["auto", "gl", "raster"]
 AUTO_RENDERER: RendererName = "raster"
 """The renderer that replaces `auto`. It works on every machine, and is the faster one where both
-were measured (docs/bench.md). It does not depend on the machine, so the same code gives the same
-images everywhere."""
+were measured (docs/explanation/benchmarks.md). It does not depend on the machine, so the same code
+gives the same images everywhere."""
 ProprioName = Literal["paper", "full"]
 StateName = Literal["absolute", "relative"]
 StartName = Literal["above", "around", "holding", "carrying"]
 RewardName = Literal["paper", "staged"]
 ImageLayout = Literal["auto", "hwc", "chw"]
-OBSERVATIONS = ("image", "proprio", "state")
-SMALLEST_IMAGE, LARGEST_IMAGE = 16, 2048
-MOST_SAMPLES = 4
-REMOVED = {
-    "renderer 'warp'": "renderer raster",
-    "reward 'near'": "reward paper or staged",
-    "reward 'far'": "reward paper or staged",
-    "reward 'both'": "reward paper or staged",
-    "floor 'smooth'": "the rough floor",
+ObservationKey = Literal["image", "depth", "proprio", "touch", "state"]
+OBSERVATION_KINDS: dict[ObservationKey, Kind] = {
+    "image": "image",
+    "depth": "depth",
+    "proprio": "vector",
+    "touch": "vector",
+    "state": "vector",
 }
-"""Values of earlier versions, which recorded runs may have, and their replacements."""
+"""Keys of an observation of merl's own tasks, with their kinds."""
+DEPTH_RANGE = (0.0, 2.0)
+"""Bounds of `depth`, m; greater distances, such as those of the sky, are clipped."""
+Samples = Annotated[int, Range(1, 4)]
+LARGEST_IMAGE = 2048
+"""Most pixels along an edge of an image."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +44,10 @@ class EnvConfig:
     OpenGL and is much faster on a CPU). Their images differ: to an agent they are different
     cameras. `auto` selects `raster`."""
 
-    image_size: int = 84
+    image_size: Annotated[int, Range(16, LARGEST_IMAGE)] = 84
     """Height and width of the agent's image, in pixels; from 16 to 2048."""
 
-    samples: int = 1
+    samples: Samples = 1
     """Samples along each edge of a pixel of the agent's image, 1 to 4, for renderer `raster`. A
     pixel is the mean of its samples. An image takes as long as one of `samples` times the size: 24
     pixels with 3 samples take as long as 72 pixels with 1."""
@@ -56,14 +60,16 @@ class EnvConfig:
     """Content of `state`: `absolute` (`full` proprioception, the object's pose and velocities, the
     target) or `relative` (also the vectors from hand to object and from object to target)."""
 
-    observations: tuple[str, ...] = ("image", "proprio")
-    """Keys of an observation: any of `image`, `proprio`, `state`. Other keys are not computed."""
+    observations: Annotated[tuple[ObservationKey, ...], NOT_EMPTY] = ("image", "proprio")
+    """Keys of an observation: any of `image`, `depth` (of the same camera, m), `proprio`, `touch`
+    (forces on the palm and the six links of the fingers) and `state`. Other keys are not
+    computed."""
 
     occluded: bool = False
     """Put a disc between the camera and the object, for `move_box` and `lift_box`. Where the camera
     does not see the object, the agent needs proprioception."""
 
-    start: tuple[StartName, ...] = ("above",)
+    start: Annotated[tuple[StartName, ...], NOT_EMPTY] = ("above",)
     """Where the hand starts: `above` (20 to 40 cm above the floor) or, for `move_box` and
     `lift_box`, `around` (open fingers around the box), `holding` (closed around the box) or
     `carrying` (closed around the box, anywhere on the way to the target). With several, each
@@ -73,34 +79,13 @@ class EnvConfig:
     """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5) or `staged` (the authors' later
     code, with one more term for the last centimetre)."""
 
-    render_size: int = 480
+    render_size: Annotated[int, Range(16, LARGEST_IMAGE)] = 480
     """Height and width of the images in videos, in pixels; from 16 to 2048."""
 
     def __post_init__(self) -> None:
-        check_not_removed("renderer", self.renderer)
-        check_choice("renderer", self.renderer, get_args(RendererChoice))
+        check_fields(self)
         if self.renderer == "auto":  # so a config and a run's record name the real one
             object.__setattr__(self, "renderer", AUTO_RENDERER)
-        check_choice("proprio", self.proprio, get_args(ProprioName))
-        check_choice("state", self.state, get_args(StateName))
-        check_not_removed("reward", self.reward)
-        check_choice("reward", self.reward, get_args(RewardName))
-        if isinstance(self.observations, str) or not self.observations:
-            raise MerlError(
-                f"observations is {self.observations!r}: give a tuple of at least one of "
-                f"{', '.join(OBSERVATIONS)}"
-            )
-        for name in self.observations:
-            check_choice("observations", name, OBSERVATIONS)
-        starts = get_args(StartName)
-        if isinstance(self.start, str) or not self.start:
-            raise MerlError(
-                f"start is {self.start!r}: give a tuple of at least one of {', '.join(starts)}"
-            )
-        for name in self.start:
-            check_choice("start", name, starts)
-        check_whole("image_size", self.image_size, SMALLEST_IMAGE, LARGEST_IMAGE)
-        check_whole("render_size", self.render_size, SMALLEST_IMAGE, LARGEST_IMAGE)
         check_samples(self.samples, self.image_size)
         if self.samples != 1 and self.renderer != "raster":
             raise MerlError(
@@ -109,39 +94,16 @@ class EnvConfig:
             )
 
 
-def check_not_removed(name: str, value: str) -> None:
-    """Reject a value that only earlier versions of merl accept.
-
-    Raises:
-        MerlError: naming the value and its replacement.
-    """
-    removed = f"{name} {value!r}"
-    if removed in REMOVED:
-        raise MerlError(
-            f"{removed} no longer exists: train again with {REMOVED[removed]}, or use the version "
-            "of merl that the run was trained with"
-        )
-
-
-def check_whole(name: str, value: int, least: int, most: int) -> None:
-    """Reject a value that is not a whole number from `least` to `most`.
-
-    Raises:
-        MerlError: naming the value and the bounds.
-    """
-    if type(value) is not int or not least <= value <= most:
-        raise MerlError(
-            f"{name} is {value!r}: give a whole number, at least {least} and at most {most}"
-        )
-
-
 def check_samples(samples: int, size: int) -> None:
-    """Reject a number of samples per pixel edge that is out of range for an image of `size` pixels.
+    """Reject more samples along an edge than the largest image has.
+
+    Args:
+        samples: samples along each edge of a pixel.
+        size: height and width of the image, in pixels.
 
     Raises:
-        MerlError: naming the value and the bounds.
+        MerlError: naming the values and the bound.
     """
-    check_whole("samples", samples, 1, MOST_SAMPLES)
     if samples * size > LARGEST_IMAGE:
         raise MerlError(
             f"samples is {samples} at {size} pixels, which is {samples * size} samples along an "
@@ -162,4 +124,4 @@ class UserEnvConfig:
     """Accept actions whose bounds are more than 1,000,000 apart."""
 
     def __post_init__(self) -> None:
-        check_choice("env.image-layout", self.image_layout, get_args(ImageLayout))
+        check_fields(self, "env.")

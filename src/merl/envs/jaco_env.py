@@ -10,9 +10,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.envs.config import EnvConfig
+from merl.envs.config import DEPTH_RANGE, EnvConfig
 from merl.envs.rendering import Renderer, check_renderer, make_renderer
-from merl.tasks.jaco import CAMERA, CONTROL_TIMESTEP, EPISODE_STEPS, PROPRIO_SIZES, JacoTask
+from merl.tasks.jaco import (
+    CAMERA,
+    CONTROL_TIMESTEP,
+    EPISODE_STEPS,
+    PROPRIO_SIZES,
+    TOUCH_SIZE,
+    JacoTask,
+)
 
 Observation = dict[str, Any]
 
@@ -21,7 +28,8 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """A Gymnasium environment for one task of the Jaco arm.
 
     An observation is a dict with the keys in `EnvConfig.observations`: `image` uint8 (H, W, 3),
-    `proprio` float32 (24,) or (42,), `state` float32 (n,). An action is float32 (9,) in [-1, 1]:
+    `depth` float32 (H, W, 1) in m, `proprio` float32 (24,) or (42,), `touch` float32 (7,), `state`
+    float32 (n,). An action is float32 (9,) in [-1, 1]:
     the velocities of the arm's six joints and of the three fingers, as fractions of their maximum.
 
     An episode has 250 steps of 0.04 s and ends by truncation. After each step, `info` holds
@@ -44,9 +52,11 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def __init__(self, task: JacoTask, config: EnvConfig, render_mode: str | None = None) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise MerlError(f"render_mode {render_mode!r} is unknown: give 'rgb_array' or None")
-        if render_mode or "image" in config.observations:
+        if render_mode or {"image", "depth"} & {*config.observations}:
             check_renderer(config.renderer)
         self.task, self.config, self.render_mode = task, config, render_mode
+        if "touch" in config.observations:
+            task.add_touch_sensors()
         self._physics: Any = self._compile()
         self._renderers: dict[tuple[int, int], Renderer] = {}  # by size and samples
         self._steps_left = 0
@@ -169,6 +179,11 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         observation: Observation = {}
         if "image" in wanted:
             observation["image"] = self._image(self.config.image_size, self.config.samples)
+        if "depth" in wanted:
+            renderer = self._renderer(self.config.image_size, 1)
+            observation["depth"] = renderer.render_depth().clip(*DEPTH_RANGE)[..., None]
+        if "touch" in wanted:
+            observation["touch"] = self.task.touch(self._physics)
         if "proprio" in wanted:
             observation["proprio"] = self.task.proprio(self._physics, self.config.proprio)
         if "state" in wanted:
@@ -184,18 +199,23 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _image(self, size: int, samples: int = 1) -> NDArray[np.uint8]:
         """Return an image of the scene, uint8 (size, size, 3)."""
+        return self._renderer(size, samples).render()
+
+    def _renderer(self, size: int, samples: int) -> Renderer:
         if (size, samples) not in self._renderers:
             renderer = make_renderer(
                 self.config.renderer, self._physics, CAMERA.name, size, samples
             )
             self._renderers[size, samples] = renderer
-        return self._renderers[size, samples].render()
+        return self._renderers[size, samples]
 
 
 def _observation_space(config: EnvConfig, state_size: int) -> spaces.Space[Observation]:
     image_shape = (config.image_size, config.image_size, 3)
     everything: dict[str, spaces.Space[Any]] = {
         "image": spaces.Box(0, 255, image_shape, np.uint8),
+        "depth": spaces.Box(*DEPTH_RANGE, (*image_shape[:2], 1), np.float32),
+        "touch": spaces.Box(0.0, np.inf, (TOUCH_SIZE,), np.float32),
         "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO_SIZES[config.proprio],), np.float32),
         "state": spaces.Box(-np.inf, np.inf, (state_size,), np.float32),
     }

@@ -31,6 +31,10 @@ class GlRenderer:
         """See `rendering.Renderer`."""
         return np.array(self._camera.render(), dtype=np.uint8)
 
+    def render_depth(self) -> NDArray[np.float32]:
+        """See `rendering.Renderer`."""
+        return np.array(self._camera.render(depth=True), dtype=np.float32)
+
     def close(self) -> None:
         """Free the scene; the OpenGL context is freed with the physics."""
         if self._camera is not None:

@@ -26,6 +26,10 @@ class Renderer(Protocol):
         """Return the current scene, uint8 (size, size, 3), as a new array."""
         ...
 
+    def render_depth(self) -> NDArray[np.float32]:
+        """Return the distance along the camera's axis, (size, size), m; the sky is far away."""
+        ...
+
     def close(self) -> None:
         """Free the resources; repeated calls have no effect."""
         ...

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import logging
 import re
 import sys
-import warnings
 from collections.abc import Callable
-from importlib.machinery import PathFinder
-from importlib.util import module_from_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,12 +16,12 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import registry
 
-from merl.core import MerlError, suggest
-from merl.core.python_path import set_value, users_value
+from merl.core import MerlError, suggest, user_code
+from merl.core.user_code import in_one_line
 from merl.envs.config import UserEnvConfig
 from merl.envs.packages import installing
 from merl.envs.registration import ENV_IDS
-from merl.envs.wrappers import adapt, failing, in_one_line
+from merl.envs.wrappers import adapt, failing
 
 BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that are part of merl."""
@@ -31,6 +29,9 @@ MakeEnv = Callable[..., gymnasium.Env[Any, Any]]
 """A function without arguments, or with `render_mode` alone, that makes an environment."""
 CLOSE = 0.8
 """Minimum similarity at which an unknown id counts as a misspelling of a known one."""
+
+
+_LOG = logging.getLogger(__name__)
 
 
 def make_user_env(
@@ -91,94 +92,12 @@ def imports_code(task: str) -> bool:
     return spec is not None and not str(spec.entry_point).startswith("gymnasium.envs.")
 
 
-def module_folder(task: str) -> Path | None:
-    """Return the folder from which the module of `module:function` or `module:Id-v0` was loaded.
-
-    Return None for a Gymnasium id without a module, and for an installed module, which Python finds
-    without the folder.
-    """
-    module, colon, _ = task.partition(":")
-    file = _file_of(module.partition(".")[0]) if colon else None
-    if file is None or {"site-packages", "dist-packages"} & {*file.parts}:
-        return None
-    return file.parent.parent if file.name == "__init__.py" else file.parent
-
-
 def load_module(task: str, *folders: Path) -> ModuleType:
-    """Import the module of `module:function` or `module:Id-v0`.
-
-    Args:
-        task: the task that names the module.
-        folders: folders that are searched first. The folder with the module is appended to
-            `sys.path`, so that the module can import its neighbours, while all other imports are
-            found where they were before.
-
-    Raises:
-        MerlError: there is no such module, or it cannot be imported.
-    """
-    module = task.partition(":")[0]
-    if not all(part.isidentifier() for part in module.split(".")):
-        raise MerlError(
-            f"task {task!r}: use module:function, for example my_robot:make_env for my_robot.py"
-        )
-    try:
-        if task not in BUNDLED:
-            set_value(users_value())  # the module may start Python processes that need the folder
-            any(_load_from(folder, module.partition(".")[0]) for folder in folders)
-        return importlib.import_module(module)
-    except MerlError:
-        raise
-    except ModuleNotFoundError as error:
-        if not f"{module}.".startswith(f"{error.name}."):
-            raise MerlError(
-                f"task {task!r}: {module!r} imports {error.name!r}, which is not installed"
-            ) from None
-        searched = " or ".join([*map(str, folders), "the installed packages"])
-        way = installing(task.partition(":")[2], module)
-        way = way or "add its folder to PYTHONPATH, or run `merl train` in its folder"
-        raise MerlError(f"task {task!r}: {error} in {searched}: {way}") from None
-    except Exception as error:
-        raise MerlError(
-            f"task {task!r}: importing {module!r} failed: {in_one_line(error)}"
-        ) from error
-
-
-def _load_from(folder: Path, name: str) -> bool:
-    """Load a top-level module or package from a folder, even if another one is installed.
-
-    Returns:
-        Whether the folder has the module.
-
-    Raises:
-        MerlError: another module of that name is loaded already.
-    """
-    importlib.invalidate_caches()
-    spec = PathFinder.find_spec(name, [str(folder)])
-    if spec is None:
-        return False
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))
-    if spec.loader is None or spec.origin is None:  # no __init__.py: installed comes first
-        return False
-    if name not in sys.modules:
-        module = sys.modules[name] = module_from_spec(spec)
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            sys.modules.pop(name, None)
-            raise
-    elif _file_of(name) != Path(spec.origin).resolve():
-        raise MerlError(
-            f"{spec.origin} cannot be imported, because another module is named {name!r} "
-            f"({_file_of(name) or 'part of Python'}): rename the file"
-        )
-    return True
-
-
-def _file_of(name: str) -> Path | None:
-    """Return the file of a loaded module; None if it has none or is not loaded."""
-    file = getattr(sys.modules.get(name), "__file__", None)
-    return None if file is None else Path(file).resolve()
+    """Import the module of `module:function` or `module:Id-v0`; see `user_code.load_module`."""
+    if task in BUNDLED:
+        return importlib.import_module(task.partition(":")[0])
+    module, _, name = task.partition(":")
+    return user_code.load_module(task, *folders, advice=installing(name, module))
 
 
 def _make(task: str, render_mode: str | None, make: Any = None) -> gymnasium.Env[Any, Any]:
@@ -255,13 +174,12 @@ def _renders(env: gymnasium.Env[Any, Any]) -> bool:
             env.reset(seed=0)
             image: Any = env.render()
     except MerlError as error:
-        warnings.warn(f"videos of the environment are not possible: {error}", stacklevel=1)
+        _LOG.warning("videos of the environment are not possible: %s", error)
         return False
     usable = isinstance(image, np.ndarray) and image.dtype == np.uint8
     if not usable or image.ndim != 3 or image.shape[2] != 3:
-        warnings.warn(
-            "videos of the environment are not possible: render() does not return uint8 (H, W, 3)",
-            stacklevel=1,
+        _LOG.warning(
+            "videos of the environment are not possible: render() does not return uint8 (H, W, 3)"
         )
         return False
     return True

@@ -10,9 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from merl.core import EnvironmentFailed, MerlError, is_image
+from merl.core import EnvironmentFailed, MerlError
 from merl.envs.config import ImageLayout
 from merl.envs.user_values import to_array
+from merl.modalities import Depth, Image, Modality, Sequence, Vector
 
 WIDEST_ACTION = 1e6
 """Maximum distance between an action's bounds; wider bounds are treated as placeholders."""
@@ -20,75 +21,90 @@ FRAMES = 12
 """Maximum number of stacked RGB frames in the channels of an image."""
 IMAGE_SIDE = 16
 """Pixels: messages treat a box with two sides of at least this size as an image."""
-BYTES = (0, 255)
 
 
 @dataclass(frozen=True)
-class Modality:
+class UserKey:
     """One observation key of an environment, and the form in which agents use it.
 
     Attributes:
         key: name of the key.
         given: the environment's box.
-        space: the form for agents: an image, uint8 (H, W, C), or a vector, float32 (n,).
+        modality: the form for agents.
         channels_first: whether the environment's image is (C, H, W).
     """
 
     key: str
     given: spaces.Box
-    space: spaces.Box
+    modality: Modality
     channels_first: bool = False
 
+    @classmethod
+    def as_trained(cls, key: str, modality: Modality) -> UserKey:
+        """Return the check of a key that needs no conversion."""
+        return cls(key, modality.space, modality)
+
     @cached_property
-    def bounds(self) -> tuple[int, int]:
-        """Lowest and highest pixel value of an image."""
-        return int(self.space.low.min()), int(self.space.high.max())
+    def bounds(self) -> tuple[float, float]:
+        """Lowest and highest value of the key."""
+        return self.modality.space.low.min().item(), self.modality.space.high.max().item()
 
     def convert(self, value: Any) -> NDArray[Any]:
-        """Convert an observation to the form of `space`.
+        """Convert an observation to the form for agents.
 
         Raises:
             EnvironmentFailed: the observation does not match `given`; the message is one line.
         """
         name = f"observation {self.key!r}"
         array = to_array(name, value)
-        if (*array.shape, 1) == self.given.shape:
-            array = array[..., None]
+        if self._is_same_but_for_axes_of_one(array):
+            array = array.reshape(self.given.shape)
         if array.shape != self.given.shape:
             raise EnvironmentFailed(
                 f"{name} has shape {array.shape}, but its space has {self.given.shape}"
             )
-        if is_image(self.space):
-            return self._as_image(name, array)
+        space = self.modality.space
+        if np.issubdtype(space.dtype, np.integer):
+            return self._as_pixels(name, array)
+        if isinstance(self.modality, Depth):  # no return may be infinity
+            array = array.clip(*self.bounds)
         if array.dtype == np.float32:
-            return array.reshape(self.space.shape)
+            return array.reshape(space.shape)
         with np.errstate(over="ignore"):
-            vector = array.astype(np.float32).reshape(self.space.shape)
-        lost = np.flatnonzero(np.isinf(vector) & ~np.isinf(array.reshape(vector.shape)))
+            floats = array.astype(np.float32).reshape(space.shape)
+        lost = np.flatnonzero(np.isinf(floats) & ~np.isinf(array.reshape(floats.shape)))
         if len(lost):
             raise EnvironmentFailed(
                 f"{name} is {array.flat[lost[0]]} at index {lost[0]}, which is beyond float32: use "
                 "other units, or clip it"
             )
-        return vector
+        return floats
 
-    def _as_image(self, name: str, array: NDArray[Any]) -> NDArray[np.uint8]:
-        low, high = self.bounds
-        if array.dtype != np.uint8:
+    def _is_same_but_for_axes_of_one(self, array: NDArray[Any]) -> bool:
+        """Return whether the shape differs only by axes of length one: (H, W) and (H, W, 1)."""
+        one, other = (
+            [side for side in shape if side != 1] for shape in (array.shape, self.given.shape)
+        )
+        return one == other
+
+    def _as_pixels(self, name: str, array: NDArray[Any]) -> NDArray[Any]:
+        space, (low, high) = self.modality.space, self.bounds
+        if array.dtype != space.dtype:
             raise EnvironmentFailed(
-                f"{name} has dtype {array.dtype}, but its space has uint8: return pixels from "
-                f"{low} to {high} as np.uint8"
+                f"{name} has dtype {array.dtype}, but its space has {space.dtype}: return pixels "
+                f"from {low} to {high} as np.{space.dtype}"
             )
-        if (low, high) != BYTES and (array.min() < low or array.max() > high):
+        whole = np.iinfo(array.dtype)
+        if (low, high) != (whole.min, whole.max) and (array.min() < low or array.max() > high):
             raise EnvironmentFailed(
                 f"{name} has pixels from {array.min()} to {array.max()}, but its space has {low} "
                 f"to {high}: set the bounds of its box to the bounds of its pixels"
             )
         moved = np.moveaxis(array, 0, -1) if self.channels_first else array
-        return moved.reshape(self.space.shape)
+        return moved.reshape(space.shape)
 
 
-def modality(key: str, space: spaces.Space[Any], layout: ImageLayout) -> Modality | None:
+def user_key(key: str, space: spaces.Space[Any], layout: ImageLayout) -> UserKey | None:
     """Return how agents use an observation key; None if they cannot (see `advice`).
 
     Args:
@@ -101,19 +117,64 @@ def modality(key: str, space: spaces.Space[Any], layout: ImageLayout) -> Modalit
     """
     if not isinstance(space, spaces.Box) or 0 in space.shape:
         return None
-    pixels = space.dtype == np.uint8
-    if len(space.shape) - space.shape.count(1) <= 1 and not (pixels and len(space.shape) == 3):
-        with np.errstate(over="ignore"):  # float64 bounds beyond float32 become infinite
-            lows, highs = (b.astype(np.float32).reshape(-1) for b in (space.low, space.high))
-        return Modality(key, space, spaces.Box(lows, highs, dtype=np.float32))
-    if not pixels or len(space.shape) not in (2, 3):
-        return None
+    shape, long_axes = space.shape, len(space.shape) - space.shape.count(1)
+    if space.dtype == np.uint8 and len(shape) in (2, 3) and (long_axes > 1 or len(shape) == 3):
+        return _image(key, space, layout)
+    if long_axes <= 1:
+        return UserKey(key, space, Vector(_floats(space, (space.low.size,))))
+    if is_depth(space):
+        return _depth(key, space)
+    if len(shape) == 2 and not _is_image_like(space):
+        return UserKey(key, space, Sequence(_floats(space, shape)))
+    return None
+
+
+def is_depth(space: spaces.Box) -> bool:
+    """Return whether a box is taken for a depth image.
+
+    It is one of distances: float or uint16, from at least 0 to a finite bound, (H, W, 1), (1, H, W)
+    or, with sides of at least 16 pixels, (H, W).
+    """
+    sides = [side for side in space.shape if side != 1]
+    distances = np.issubdtype(space.dtype, np.floating) or space.dtype == np.uint16
+    axes = len(space.shape)
+    return (
+        distances
+        and ((axes == 3 and len(sides) == 2) or (axes == 2 and min(space.shape) >= IMAGE_SIDE))
+        and bool(space.low.min() >= 0 and np.isfinite(space.high).all())
+    )
+
+
+def _image(key: str, space: spaces.Box, layout: ImageLayout) -> UserKey:
     channels_first = len(space.shape) == 3 and _channels_first(key, space.shape, layout)
     shape = (*space.shape[1:], space.shape[0]) if channels_first else space.shape
     if len(shape) == 2:
         shape = (*shape, 1)
     low, high = _pixel_bounds(key, space, channels_first)
-    return Modality(key, space, spaces.Box(low, high, shape, np.uint8), channels_first)
+    return UserKey(key, space, Image(spaces.Box(low, high, shape, np.uint8)), channels_first)
+
+
+def _depth(key: str, space: spaces.Box) -> UserKey:
+    low, high = space.low.min().item(), space.high.max().item()
+    if not low < high:
+        raise MerlError(
+            f"observation {key!r} has distances from {low} to {high}: set the bounds of its box to "
+            "the nearest and the farthest distance"
+        )
+    height, width = (side for side in space.shape if side != 1)
+    dtype: Any = np.uint16 if space.dtype == np.uint16 else np.float32
+    return UserKey(key, space, Depth(spaces.Box(low, high, (height, width, 1), dtype)))
+
+
+def _floats(space: spaces.Box, shape: tuple[int, ...]) -> spaces.Box:
+    """Return a float32 box with the bounds of `space`."""
+    with np.errstate(over="ignore"):  # float64 bounds beyond float32 become infinite
+        lows, highs = (b.astype(np.float32).reshape(shape) for b in (space.low, space.high))
+    return spaces.Box(lows, highs, dtype=np.float32)
+
+
+def _is_image_like(space: spaces.Box) -> bool:
+    return sorted(space.shape)[-2] >= 2 * IMAGE_SIDE
 
 
 def advice(space: spaces.Space[Any]) -> str:
@@ -142,8 +203,8 @@ def advice(space: spaces.Space[Any]) -> str:
         return _image_advice(space)
     size = int(np.prod(space.shape))
     return (
-        "merl stacks the frames of images itself, so remove a wrapper that stacks; to keep a "
-        f"history or a table of numbers, flatten it to a box ({size},)"
+        "merl stacks the frames of images itself, so remove a wrapper that stacks; a history of "
+        f"numbers is a box (samples, numbers), other numbers can be flattened to a box ({size},)"
     )
 
 
@@ -262,8 +323,12 @@ def _image_advice(box: spaces.Box) -> str:
         )
     if low >= -1 and high <= 1:
         return f"an image must be uint8: return (127.5 * (x + 1)).astype(np.uint8) {target}"
+    if len(box.shape) - box.shape.count(1) == 2:
+        return (
+            "a depth image needs finite bounds, the nearest distance (at least 0) and the farthest "
+            f"one; other numbers can be flattened to a box ({int(np.prod(box.shape))},)"
+        )
     return (
-        "an image must be uint8: scale by the largest relevant value, for a depth image the "
-        f"largest distance, (255 * np.clip(x / largest, 0, 1)).astype(np.uint8) {target}; other "
-        f"numbers can be flattened to a box ({int(np.prod(box.shape))},)"
+        "an image must be uint8: scale by the largest relevant value, "
+        f"(255 * np.clip(x / largest, 0, 1)).astype(np.uint8) {target}"
     )

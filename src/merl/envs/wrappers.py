@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import signal
-import sysconfig
-import traceback
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -17,8 +14,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.core import EnvironmentFailed, MerlError, NotFinite, counted
+from merl.core.user_code import in_one_line
 from merl.envs.config import UserEnvConfig
-from merl.envs.user_spaces import Modality, action_bounds, advice, brief, modality
+from merl.envs.user_spaces import UserKey, action_bounds, advice, brief, is_depth, user_key
 from merl.envs.user_values import shown, to_bool, to_info, to_number
 
 
@@ -28,8 +26,9 @@ def adapt(
     """Convert an environment to the form that agents use.
 
     A plain box of numbers becomes `state`, and a plain image becomes `image`. From a `Dict`, images
-    (uint8 boxes) and vectors (boxes with one axis) are kept, and other keys are left out. A box of
-    actions with finite bounds is rescaled to [-1, 1]. `info["is_success"]` counts as `success`.
+    (uint8 boxes), depth images (boxes of distances), vectors (boxes with one axis) and histories
+    (boxes with two axes) are kept, and other keys are left out. A box of actions with finite bounds
+    is rescaled to [-1, 1]. `info["is_success"]` counts as `success`.
 
     Args:
         env: the user's environment.
@@ -44,6 +43,9 @@ def adapt(
     return Adapted(env, config or UserEnvConfig())
 
 
+_LOG = logging.getLogger(__name__)
+
+
 class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment with a `Dict` of images and vectors as observation, and actions in [-1, 1].
 
@@ -53,7 +55,7 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         config: how to interpret its spaces.
 
     Attributes:
-        modalities: the observation keys that agents can use, each with its conversion.
+        keys: the observation keys that agents can use, each with its conversion.
         left_out: the other keys, each with the reason and advice.
         own_bounds: the environment's lower bounds and upper bounds of the actions.
     """
@@ -69,28 +71,29 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
         given = env.observation_space
         self._plain = None if isinstance(given, spaces.Dict) else _plain_key(given)
         parts = given.spaces if isinstance(given, spaces.Dict) else {str(self._plain): given}
-        self.modalities: dict[str, Modality] = {}
+        self.keys: dict[str, UserKey] = {}
         self.left_out: dict[str, str] = {}
         for key, part in parts.items():
             if not isinstance(key, str):
                 raise MerlError(
                     f"the environment's observation has the key {key!r}: use a string as key"
                 )
-            used = modality(key, part, config.image_layout)
+            used = user_key(key, part, config.image_layout)
             if used is None:
                 self.left_out[key] = f"{brief(part)}: {advice(part)}"
             else:
-                self.modalities[key] = used
-        if not self.modalities:
+                self.keys[key] = used
+        if not self.keys:
             reasons = [
                 reason if self._plain else f"{key!r} is {reason}"
                 for key, reason in self.left_out.items()
             ]
             raise MerlError(
-                "the environment's observation has neither an image (a uint8 box, H x W x C) nor a "
-                f"vector (a box of n numbers): {'; '.join(reasons) or 'it is an empty Dict'}"
+                "the environment's observation has neither an image (a uint8 box, H x W x C), nor "
+                "a depth image, a vector (a box of n numbers) or a history: "
+                f"{'; '.join(reasons) or 'it is an empty Dict'}"
             )
-        self.observation_space = spaces.Dict({k: m.space for k, m in self.modalities.items()})
+        self.observation_space = spaces.Dict({k: u.modality.space for k, u in self.keys.items()})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -139,7 +142,7 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
             with failing("close"):
                 self.env.close()
         except MerlError as error:
-            warnings.warn(str(error), stacklevel=1)
+            _LOG.warning("%s", error)
 
     def _scaled(self, action: NDArray[np.float32]) -> NDArray[Any]:
         """Rescale an action from [-1, 1] to the environment's bounds, never beyond them."""
@@ -162,18 +165,22 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
                 f"the environment's observation is a {type(whole).__name__}, but its space is a "
                 "Dict"
             )
-        for key in self.modalities:
+        for key in self.keys:
             if key not in whole:
                 raise EnvironmentFailed(
                     f"the environment's observation lacks {key!r}, which its space has"
                 )
-        return {key: used.convert(whole[key]) for key, used in self.modalities.items()}
+        return {key: used.convert(whole[key]) for key, used in self.keys.items()}
 
 
 def _plain_key(space: spaces.Space[Any]) -> str:
     """Return the key for an observation that is not a `Dict`."""
     shape = space.shape or ()
-    return "image" if space.dtype == np.uint8 and len(shape) - shape.count(1) > 1 else "state"
+    if len(shape) - shape.count(1) <= 1:
+        return "state"
+    if isinstance(space, spaces.Box) and is_depth(space):
+        return "depth"
+    return "image" if space.dtype == np.uint8 else "history"
 
 
 @contextmanager
@@ -196,40 +203,6 @@ def failing(what: str) -> Iterator[None]:
 def _ctrl_c_raises() -> bool:
     """Return whether Ctrl-C raises KeyboardInterrupt; else the environment itself raised it."""
     return signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def in_one_line(error: BaseException) -> str:
-    """Return an exception's type and text, and the last line in the user's files that led to it.
-
-    Of a `MerlError`, whose message is made for the user, return only the message.
-    """
-    if isinstance(error, MerlError):
-        return str(error)
-    try:
-        text = " ".join(str(error).split())
-    except Exception:  # the exception's own __str__ may fail
-        text = ""
-    kind = type(error).__name__
-    described = f"{kind}: {text}" if text else kind
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if _is_users(frame.filename):
-            return f"{described} ({Path(frame.filename).name}, line {frame.lineno})"
-    return described
-
-
-def _is_users(filename: str) -> bool:
-    """Return whether code is in an existing file outside Python, installed packages and merl."""
-    path = Path(filename)
-    if filename.startswith("<") or not path.is_file():
-        return False
-    path = path.resolve()
-    names = ("stdlib", "platstdlib", "purelib", "platlib")
-    libraries = [Path(sysconfig.get_path(name)).resolve() for name in names]
-    libraries.append(Path(__file__).resolve().parents[1])
-    return not (
-        any(path.is_relative_to(library) for library in libraries)
-        or {"site-packages", "dist-packages"} & {*path.parts}
-    )
 
 
 def _unpacked(what: str, given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:

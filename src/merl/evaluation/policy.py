@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,16 @@ from merl.acting.rollout import FrameStack
 from merl.acting.run_env import make_run_env, own_bounds, run_spaces
 from merl.agents import make_agent
 from merl.config import TrainConfig
-from merl.core import Agent, MerlError, NotFinite, Observation, is_image
+from merl.core import Agent, MerlError, NotFinite, Observation
 from merl.envs.user_env import MakeEnv
-from merl.envs.user_spaces import Modality
+from merl.envs.user_spaces import UserKey
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.video import MIN_SIDE
-from merl.runs.checkpoint import Checkpoint, load_networks, readable
+from merl.modalities import modalities_of
+from merl.runs.checkpoint import Checkpoint, load_policy_of, readable
 from merl.runs.run import Run
+
+_LOG = logging.getLogger(__name__)
 
 
 class Policy:
@@ -52,9 +55,10 @@ class Policy:
         self.config, self.step, self._run = config, step, run
         self.reports_success = reports_success
         self._agent = agent
-        self._modalities = {key: _as_trained(key, space[key]) for key in agent.senses}
-        images = tuple(key for key in agent.senses if is_image(space[key]))
-        self._stack = FrameStack(config.replay.frame_stack, images, device)
+        known = modalities_of(space)
+        modalities = {key: known[key] for key in agent.senses}
+        self._keys = {key: UserKey.as_trained(key, m) for key, m in modalities.items()}
+        self._stack = FrameStack(modalities, config.replay.frame_stack, device)
         self._fresh = True
 
     def reset(self) -> None:
@@ -65,8 +69,8 @@ class Policy:
         """Return the action for an observation.
 
         Args:
-            observation: an observation of the environment: images uint8 (H, W, C), vectors float
-                (n,).
+            observation: an observation of the environment, with the types and shapes of training
+                (merl.modalities).
 
         Returns:
             The action, float32 (A,), in [-1, 1].
@@ -76,13 +80,13 @@ class Policy:
                 converted to an array.
             NotFinite: the observation contains NaN or infinity.
         """
-        sensed = {key: self._checked(key, observation) for key in self._modalities}
+        sensed = {key: self._checked(key, observation) for key in self._keys}
         if self._fresh:
             self._stack.reset(sensed)
         else:
             self._stack.push(sensed)
         self._fresh = False
-        action = self._agent.act(self._stack.observation(), explore=False)[0]
+        action = self._agent.act(self._stack.observation(), explore=False, step=self.step)[0]
         result: NDArray[np.float32] = action.to("cpu", torch.float32).numpy()
         return result
 
@@ -108,10 +112,11 @@ class Policy:
         if renderer == "auto" and not self.config.own_env:
             renderer = changes["renderer"] = self.config.env.renderer
         if renderer != self.config.env.renderer and not self.config.own_env:
-            warnings.warn(
-                f"the agent was trained with renderer {self.config.env.renderer!r} but now uses "
-                f"{renderer!r}: their images differ, and the agent may perform worse",
-                stacklevel=2,
+            _LOG.warning(
+                "the agent was trained with renderer %r but now uses %r: their images differ, and "
+                "the agent may perform worse",
+                self.config.env.renderer,
+                renderer,
             )
             changes.setdefault("samples", 1)  # the recorded value is for that renderer
         if self._run is not None and env is None:
@@ -178,28 +183,26 @@ class Policy:
         if not isinstance(observation, Mapping):
             raise MerlError(
                 f"the observation is a {type(observation).__name__}: give a dict with the keys "
-                f"{list(self._modalities)}"
+                f"{list(self._keys)}"
             )
         if key not in observation:
-            raise MerlError(
-                f"the observation lacks {key!r}: the agent needs {list(self._modalities)}"
-            )
-        value = self._modalities[key].convert(observation[key])
+            raise MerlError(f"the observation lacks {key!r}: the agent needs {list(self._keys)}")
+        value = self._keys[key].convert(observation[key])
         if not np.isfinite(value).all():
             raise NotFinite(f"observation {key!r} contains NaN or infinity: {value}")
         return value
 
 
-def _as_trained(key: str, space: spaces.Space[Any]) -> Modality:
-    """Return the check of an observation key that needs no conversion."""
-    assert isinstance(space, spaces.Box)
-    return Modality(key, space, space)
-
-
 def load_policy(
-    run: str | Path, *, checkpoint: str | int = "latest", threads: int | None = 1
+    run: str | Path,
+    *,
+    checkpoint: str | int = "latest",
+    threads: int | None = 1,
+    trust: bool = False,
 ) -> Policy:
-    """Load the policy of a run; no code of the run is imported or executed.
+    """Load the policy of a run.
+
+    No code of the run is imported or executed, except that of a user's own agent.
 
     Args:
         run: the folder of the run.
@@ -207,9 +210,12 @@ def load_policy(
         threads: CPU threads that compute an action; None uses torch's setting. For a single
             observation, several threads mostly wait for each other. Torch's setting for the rest of
             the program is restored after each action.
+        trust: import a user's own agent that the run names, although you have not trained this run
+            on this machine. This runs code of the author of the run.
 
     Raises:
-        MerlError: there is no run or no complete checkpoint in it, or `threads` is not possible.
+        MerlError: there is no run or no complete checkpoint in it, `threads` is not possible, or
+            the run's own agent is not trusted.
     """
     most = os.cpu_count() or 1
     if threads is not None and (type(threads) is not int or not 1 <= threads <= most):
@@ -217,13 +223,15 @@ def load_policy(
             f"threads is {threads!r}: give None, or an integer from 1 to {most}, the number of "
             "CPUs of this machine"
         )
-    opened = Run.open(Path(run))
+    opened = Run.open(Path(run)).with_agent(trusted=trust)
+    opened.load_encoders(trusted=trust)
     saved = Checkpoint.find(opened.checkpoints, str(checkpoint))
     config, device = opened.config, torch.device("cpu")
     if config.device == "cuda" and torch.cuda.is_available():
         device = torch.device("cuda")
     observation_space, action_space = opened.spaces()
     agent = make_agent(
+        config.agent_name,
         config.agent,
         observation_space,
         action_space,
@@ -232,7 +240,7 @@ def load_policy(
         device=device,
         threads=threads,
     )
-    load_networks(agent.networks, saved)
+    load_policy_of(agent, saved)
     with readable(saved):
         reports_success = bool(saved.state()["progress"].get("reports_success", False))
     return Policy(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,14 +13,14 @@ import numpy as np
 
 from merl.acting.rollout import Episode
 from merl.core import MerlError
+from merl.core.user_code import in_one_line
 from merl.envs.frame_rate import frame_rate
-from merl.envs.wrappers import in_one_line
 from merl.evaluation.video import FPS, Value, VideoWriter
 
 
 def warn_user(message: str) -> None:
-    """Issue a Python warning at the caller of the caller."""
-    warnings.warn(message, stacklevel=3)
+    """Log a warning."""
+    logging.getLogger(__name__).warning("%s", message)
 
 
 class EpisodeVideo:

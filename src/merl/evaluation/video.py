@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import av
 import numpy as np
@@ -29,35 +27,27 @@ Value = str | bool | int | float
 """A value of a caption; a float is rounded to one decimal, a bool becomes yes or no."""
 
 
-class VideoWriter:
+class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
     """Writer of an MP4 file (H.264, yuv420p); a context manager.
 
     Until `close` the video has a temporary name beside `path`, so that an incomplete video never
     has the final name. An exception in the `with` block removes it.
 
+    The video has the size of the first frame, without its last row or column if that size is odd; a
+    frame with a side below 480 pixels is enlarged by an integer factor.
+
     Args:
         path: the file to write, usually `*.mp4`; its folder is created, an existing file replaced.
         fps: frames per second; for real time, 1 / (seconds between two added frames).
-        size: (width, height) of the video in pixels, both even; frames of another size are scaled
-            to it. None: the size of the first frame, without its last row or column if that size is
-            odd; a frame with a side below 480 pixels is enlarged by an integer factor.
 
     Raises:
         MerlError: the file cannot be written, or the installed PyAV has no H.264 encoder.
-        ValueError: a side of `size` is odd or below 480 pixels.
     """
 
-    def __init__(
-        self, path: Path | str, fps: float = FPS, size: tuple[int, int] | None = None
-    ) -> None:
-        if size is not None and (min(size) < MIN_SIDE or size[0] % 2 or size[1] % 2):
-            raise ValueError(
-                f"the sides of a video must be even and at least {MIN_SIDE} pixels, not {size}"
-            )
+    def __init__(self, path: Path | str, fps: float = FPS) -> None:
         self._path = Path(path)
         self._part = self._path.with_name(f".{self._path.name}.part")
         self._rate = Fraction(fps).limit_denominator(1001)
-        self._size = size
         self._stream: VideoStream | None = None
         self._shape: tuple[int, ...] | None = None  # of the first frame, (H, W, 3)
         self._frames = 0
@@ -75,16 +65,7 @@ class VideoWriter:
         except OSError as error:
             raise self._failure(error) from None
 
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish the video, or remove it if the block raised an exception."""
         if kind is None:
             self.close()
@@ -111,13 +92,11 @@ class VideoWriter:
         if self._stream is None:
             self._stream = self._open_stream(self._container, frame)
         width, height = self._stream.width, self._stream.height
-        if self._size is None:
-            image = frame[:height, :width]
-        elif frame.shape[:2] != (height, width):
-            scaled = Image.fromarray(frame).resize((width, height), Image.Resampling.LANCZOS)
-            image = np.asarray(scaled)
+        if frame.shape[0] < height:
+            enlarged = Image.fromarray(frame).resize((width, height), Image.Resampling.LANCZOS)
+            image = np.asarray(enlarged)
         else:
-            image = frame
+            image = frame[:height, :width]
         if caption:
             image = _captioned(image, caption)
         self._encode(self._container, self._stream, np.ascontiguousarray(image))
@@ -158,12 +137,7 @@ class VideoWriter:
             raise MerlError(
                 f"a video frame must be uint8 (H, W, 3), not {frame.dtype} {frame.shape}"
             )
-        if self._shape is None:
-            self._shape = frame.shape
-            times = math.ceil(MIN_SIDE / min(frame.shape[:2]))
-            if self._size is None and times > 1:
-                times += times % 2  # an even size
-                self._size = (times * frame.shape[1], times * frame.shape[0])
+        self._shape = self._shape or frame.shape
         if frame.shape != self._shape:
             raise MerlError(
                 f"video frame has shape {frame.shape}, but the first one had {self._shape}"
@@ -173,7 +147,9 @@ class VideoWriter:
         options = {"crf": "20", "preset": "veryfast"}
         stream = container.add_stream("libx264", rate=self._rate, options=options)
         height, width = frame.shape[:2]
-        stream.width, stream.height = self._size or (width // 2 * 2, height // 2 * 2)
+        times = math.ceil(MIN_SIDE / min(height, width))
+        times += times % 2 if times > 1 else 0  # an even size
+        stream.width, stream.height = times * width // 2 * 2, times * height // 2 * 2
         stream.pix_fmt = "yuv420p"  # every player supports this format; it needs even sides
         return stream
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, get_args
 
 import torch
 import tyro
 
-from merl.agents import AGENTS
+from merl.agents import AGENTS, find_agent
+from merl.agents.config import AgentConfig
 from merl.config import EvaluationConfig, Setting, TrainConfig
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
@@ -27,7 +29,8 @@ class Preset:
     Attributes:
         about: purpose of the preset, in one line.
         config: all values except the agent's.
-        agent: values of the agent's config that differ from the agent's defaults, for every agent.
+        agent: values of the agent's config that differ from the agent's defaults, for every agent
+            that is based on merl's learner.
         agent_name: the default agent.
         own_env: values that differ for a user's own environment. It may be a robot: there is only
             one, and its steps cost more than updates.
@@ -46,7 +49,7 @@ PRESETS: dict[str, Preset] = {
         TrainConfig(_TASK, env=EnvConfig(renderer="gl")),
     ),
     "laptop": Preset(
-        "made for 2 cores without a GPU: learns in half an hour",  # docs/laptop.md
+        "made for 2 cores without a GPU: learns in half an hour",  # docs/explanation/laptop.md
         TrainConfig(
             _TASK,
             steps=1_000_000,
@@ -156,7 +159,7 @@ PUBLISHED: dict[str, Published] = {
         {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
     ),
 }
-"""Values that replace the preset's with `--setting published` (docs/agents/)."""
+"""Values that replace the preset's with `--setting published` (docs/explanation/agents/)."""
 
 
 def default_preset() -> str:
@@ -172,7 +175,8 @@ def compose(
     Args:
         preset: a key of `PRESETS`.
         task: the name of the task.
-        agent: a key of `AGENTS`; by default the preset's agent.
+        agent: a key of `AGENTS`, or `module:Class`, which may be in the working folder; by default
+            the preset's agent.
         setting: `matched`: the preset's values for the agent, which are MERL's; `published`: the
             values of the agent's authors.
 
@@ -182,7 +186,7 @@ def compose(
     check_choice("preset", preset, tuple(PRESETS))
     chosen = PRESETS[preset]
     name = agent or chosen.agent_name
-    check_choice("agent", name, tuple(AGENTS))
+    base = find_agent(name, Path.cwd()).config
     check_choice("setting", setting, get_args(Setting))
     config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
     if config.own_env:
@@ -190,12 +194,7 @@ def compose(
     else:  # not for a user's environment: it may be a robot, which must not move unless asked
         evaluation = dataclasses.replace(config.eval, references=True)
         config = dataclasses.replace(config, eval=evaluation)
-    values = dict(chosen.agent)
-    base = AGENTS[name]
-    if preset == "paper" and base.head_norm:
-        values["head_layers"] = HEAD_LAYERS.get(task, base.head_layers)
-    if base.noise_std_end is not None:  # the noise falls within the run
-        values["noise_steps"] = min(base.noise_steps, config.steps // 2)
+    values = _agent_values(base, chosen, config) if isinstance(base, AgentConfig) else {}
     if setting == "published":
         if name not in PUBLISHED:
             raise MerlError(
@@ -206,7 +205,17 @@ def compose(
         replay = dataclasses.replace(config.replay, **published.replay)
         config = dataclasses.replace(config, replay=replay, **published.run)
         values = dict(published.agent)
-    if base.vectors and task not in ENV_IDS:  # only merl's own tasks have the key `state`
-        values["vectors"] = None
+    if base.keys and name in AGENTS and task not in ENV_IDS:  # only merl's tasks have `state`
+        values |= {"keys": None, "modalities": ("vector", "sequence")}
     made = dataclasses.replace(base, **values)
     return dataclasses.replace(config, agent_name=name, agent=made)
+
+
+def _agent_values(base: AgentConfig, preset: Preset, config: TrainConfig) -> dict[str, Any]:
+    """Return the values of a preset for an agent that is based on merl's learner."""
+    values = dict(preset.agent)
+    if config.preset == "paper" and base.head_norm:
+        values["head_layers"] = HEAD_LAYERS.get(config.task, base.head_layers)
+    if base.noise_std_end is not None:  # the noise falls within the run
+        values["noise_steps"] = min(base.noise_steps, config.steps // 2)
+    return values

@@ -44,7 +44,7 @@ CASES = (
     Case(PENDULUM, "ddpg", 20_000),
     Case(PENDULUM, "sac", 20_000),
 )
-"""The cases of docs/small_tasks.md."""
+"""The cases of docs/explanation/small_tasks.md."""
 
 _SMALL: dict[str, Any] = {"hidden_dim": 128}
 _PENDULUM: dict[str, Any] = _SMALL | {"learning_rate": 1e-3}
@@ -61,10 +61,10 @@ _DOT_DISCOUNT = 0.8
 def small_config(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> TrainConfig:
     """Return the config of a case, with `evaluations` evaluations during the run."""
     task, agent, steps, precision = case
-    chosen = AGENTS[agent]
+    chosen = AGENTS[agent].config
     values, discount = (_PENDULUM, 0.99) if task == PENDULUM else (_DOT, _DOT_DISCOUNT)
     values = values | {"precision": precision}
-    if chosen.noise_std_end is not None:
+    if agent == "drqv2":
         values |= {"noise_steps": steps // 2}
     return TrainConfig(
         task,

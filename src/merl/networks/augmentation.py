@@ -1,4 +1,4 @@
-"""Random shift (MERL 4.1, DrQ-v2) and the conversion of stacked frames to the network's input."""
+"""Random shift (MERL 4.1, DrQ-v2)."""
 
 from __future__ import annotations
 
@@ -87,39 +87,3 @@ def _shift_by_index(images: Tensor, shifts: Tensor, pad: int) -> Tensor:
         columns.clamp(0, width - 1)[:, None, :],
     ]  # (B, H, W, K, C)
     return gathered.permute(0, 3, 1, 2, 4)
-
-
-def to_input(images: Tensor, dtype: torch.dtype, middle: int = 128) -> Tensor:
-    """Convert stacked bytes (B, K, H, W, C) to a convolution's input: (B, K C, H, W), x - middle.
-
-    These integers are exact in bf16, unlike x / 255 - 0.5. The weights of the first convolution
-    apply the scale (`encoders.ConvEncoder`). The memory order is channels-last, in which
-    convolutions are fastest.
-
-    Args:
-        images: uint8.
-        dtype: type of the result.
-        middle: value that is subtracted from each pixel.
-    """
-    pixels = _centred(images).view(torch.int8).flatten(3).to(dtype)
-    if middle != 128:
-        pixels = pixels + (128 - middle)
-    return pixels.permute(0, 3, 1, 2)
-
-
-def _centred(images: Tensor) -> Tensor:
-    """Permute (B, K, H, W, C) to (B, H, W, K, C) and subtract 128 from each byte (as int8)."""
-    if images.device.type != "cpu":
-        return _centred_at_once(images)
-    batch, stack, height, width, channels = images.shape
-    interleaved = images.new_empty((batch, height, width, stack, channels))
-    # One copy per channel reads whole images; a single permuted copy would read 3 bytes a time.
-    for frame in range(stack):
-        for channel in range(channels):
-            interleaved[..., frame, channel] = images[:, frame, ..., channel]
-    return interleaved.bitwise_xor_(128)
-
-
-def _centred_at_once(images: Tensor) -> Tensor:
-    """Do the same in one operation; `_shift_by_index` returns this memory order already."""
-    return images.permute(0, 2, 3, 1, 4).contiguous().bitwise_xor(128)

@@ -10,18 +10,21 @@ from torch import Tensor, nn
 
 from merl.networks.names import module_name
 
-Squash = Literal["tanh", "simnorm"]
-SIMNORM_GROUP = 8  # features that share one softmax, as in SimNorm (TD-MPC2)
+FusionLayer = Literal["tanh", "simnorm", "attention"]
+GROUPS: dict[FusionLayer, int] = {"tanh": 1, "simnorm": 8, "attention": 4}
+"""The part of each key must be a multiple of this: of the numbers that share one softmax in SimNorm
+(TD-MPC2), and of the heads of attention."""
 
 
 class Fusion(nn.Module):
-    """h_psi: Linear, LayerNorm and tanh for each modality, concatenated.
+    """h_psi: Linear, LayerNorm and tanh for each key, concatenated.
 
     Args:
         features: the length of each modality's encoding, by key, in the order of concatenation.
-        share: length of each modality's part of the latent; with simnorm a multiple of eight.
+        share: length of each key's part of the latent, a multiple of `GROUPS[layer]`.
         layer_norm: whether to normalise (Figure 3c of the paper tests without).
-        squash: "tanh", or "simnorm" for a softmax over groups of eight.
+        layer: "tanh", "simnorm" for a softmax over groups of eight, or "attention": each key is a
+            token, which attends to all, with a residual connection and tanh.
 
     Attributes:
         latent_dim: d, the length of the latent.
@@ -33,10 +36,10 @@ class Fusion(nn.Module):
         features: Mapping[str, int],
         share: int,
         layer_norm: bool = True,
-        squash: Squash = "tanh",
+        layer: FusionLayer = "tanh",
     ) -> None:
         super().__init__()
-        self.squash = squash
+        self.layer = layer
         self.latent_dim = share * len(features)
         self.modalities = tuple(features)
         self.projections = nn.ModuleDict(
@@ -48,20 +51,27 @@ class Fusion(nn.Module):
                 for key in features
             }
         )
+        self.attention: nn.MultiheadAttention | None = None
+        if layer == "attention":
+            self.attention = nn.MultiheadAttention(share, GROUPS[layer], batch_first=True)
 
     def forward(self, encoded: Mapping[str, Tensor]) -> Tensor:
-        """Fuse encodings {key: (B, F_key)} to the latent (B, d), each entry in (-1, 1)."""
+        """Fuse encodings {key: (B, F_key)} to the latent (B, d), each entry in [-1, 1]."""
         latents = []
         layers = zip(self.modalities, self.projections.values(), self.norms.values(), strict=True)
         for key, projection, norm in layers:
             projected = projection(encoded[key]).to(projection.weight.dtype)
-            latents.append(self._squash(norm(projected)))
-        return torch.cat(latents, dim=-1)  # (B, d)
+            latents.append(norm(projected))
+        if self.attention is not None:
+            tokens = torch.stack(latents, dim=1)  # (B, M, d / M)
+            attended, _ = self.attention(tokens, tokens, tokens, need_weights=False)
+            latents = list((tokens + attended.to(tokens.dtype)).unbind(dim=1))
+        return torch.cat([self._bounded(latent) for latent in latents], dim=-1)  # (B, d)
 
-    def _squash(self, latent: Tensor) -> Tensor:
-        if self.squash == "tanh":
+    def _bounded(self, latent: Tensor) -> Tensor:
+        if self.layer != "simnorm":
             return torch.tanh(latent)
-        groups = latent.reshape(len(latent), -1, SIMNORM_GROUP)
+        groups = latent.reshape(len(latent), -1, GROUPS["simnorm"])
         return torch.softmax(groups, dim=-1).flatten(-2)
 
 

@@ -1,7 +1,8 @@
 """Replay of single frames; sampling makes the frame stacks and the n-step returns."""
 
 from merl.replay.buffer import ReplayBuffer
-from merl.replay.config import ReplayConfig, check_fits, replay_bytes
-from merl.replay.ring import EpisodeRing
+from merl.replay.capacity import check_fits
+from merl.replay.config import ReplayConfig
+from merl.replay.spec import ReplaySpec
 
-__all__ = ["EpisodeRing", "ReplayBuffer", "ReplayConfig", "check_fits", "replay_bytes"]
+__all__ = ["ReplayBuffer", "ReplayConfig", "ReplaySpec", "check_fits"]

@@ -1,129 +1,118 @@
-"""Lossless compression of images: the difference from the background, compressed by LZ4.
+"""Lossless compression of frames: the difference from the background, compressed by LZ4.
 
-The images of a fixed camera are mostly static. So an image is stored as its difference from a
-*background* (`backgrounds.py`). Compressed images differ in size and are stored one after the other
-in a ring of bytes; if they need more bytes than reserved, the ring holds fewer steps.
+The images of a fixed camera are mostly static. So a frame is stored as its difference from a
+*background* (`backgrounds.py`). Compressed frames differ in size and are stored one after the other
+in a ring of bytes; if they need more bytes than reserved, the replay holds fewer steps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import lz4.block
 import numpy as np
 from numpy.typing import NDArray
 
 from merl.replay.backgrounds import Backgrounds
-from merl.replay.ring_index import RingIndex
+from merl.replay.spec import Field
 
 
-def reserved_bytes(picture_bytes: int) -> int:
-    """Return the bytes that are reserved for an image, on average.
-
-    A quarter: the arm's images at 84x84 take 3.6 KB with `raster` and 3.5 KB with `gl`, of 21.2 KB.
-    Smaller images compress less: at 24x24 they take a third, so that the ring holds fewer steps.
-    """
-    return picture_bytes // 4 + 64
-
-
-SLOTS_OF_ANY_PICTURE = 5
-"""Slots whose reserved bytes can hold an incompressible image, which LZ4 enlarges by 1/255."""
-
-
-class CompressedPictures:
-    """Compressed images of one observation key.
-
-    Byte positions always increase; `ring_index` maps a position to its byte in the ring. No image
-    crosses the end of the ring.
+class CompressedFrames:
+    """Compressed frames of one observation key, in all rings.
 
     Args:
-        ring: the bytes.
-        ring_index: map from positions to bytes of the ring.
-        spans: start position and number of bytes of each slot's image: (slots, 2).
-        shape: shape of an image, uint8.
-        starts: file of the images that the backgrounds are made from; None keeps them in memory.
+        field: type (an unsigned integer) and shape of a frame.
+        data: the bytes.
+        spans: first byte and number of bytes of each slot's frame, (slots, 2).
+        starts: file of the frames that the backgrounds are made from; None: in memory only.
 
     Attributes:
+        field: type and shape of a frame.
         backgrounds: backgrounds from which the differences are taken.
     """
 
     def __init__(
-        self,
-        ring: NDArray[np.uint8],
-        ring_index: RingIndex,
-        spans: NDArray[np.int64],
-        shape: tuple[int, ...],
-        starts: Path | None,
+        self, field: Field, data: NDArray[np.uint8], spans: NDArray[np.int64], starts: Path | None
     ) -> None:
-        self.shape = shape
-        self._ring, self._ring_index, self._spans = ring, ring_index, spans
-        self._size = int(np.prod(shape))
-        self._head = 0  # position of the next image
-        self.backgrounds = Backgrounds(self._size, starts)
+        self.field, self._data, self._spans = field, data, spans
+        self.backgrounds = Backgrounds(field, starts)
 
-    def encode(self, picture: NDArray[np.uint8]) -> bytes:
-        """Encode an image: the number of its background, then the compressed difference."""
+    def encode(self, frame: NDArray[Any]) -> bytes:
+        """Encode a frame: the number of its background, then the compressed difference."""
         number = len(self.backgrounds) - 1
         # The subtraction wraps around; decoding reverses it.
-        difference = picture.reshape(-1) - self.backgrounds[number]
+        difference = frame.reshape(-1) - self.backgrounds[number]
         packed: bytes = lz4.block.compress(difference, store_size=False)
         return bytes([number]) + packed
 
-    def end_of(self, encoded: bytes) -> int:
-        """Return the position after an encoded image, if it were written next."""
-        return self._begin(len(encoded)) + len(encoded)
-
-    def overwritten(self, slot: int, end: int) -> bool:
-        """Return whether writing up to position `end` overwrites the image of a slot."""
-        return bool(self._spans[slot, 0] < end - len(self._ring))
-
-    def write(self, slot: int, encoded: bytes) -> None:
-        """Write an encoded image after the newest one."""
-        begin = self._begin(len(encoded))
-        self._spans[slot] = begin, len(encoded)
-        self._bytes(slot)[:] = np.frombuffer(encoded, np.uint8)
-        self._head = begin + len(encoded)
+    def span(self, slot: int) -> tuple[int, int]:
+        """Return the first byte and the number of bytes of the frame in a slot."""
+        begin, count = self._spans[slot].tolist()
+        return begin, count
 
     def read(self, slot: int) -> bytes:
-        """Return the encoded image of a slot."""
-        return self._bytes(slot).tobytes()
+        """Return the encoded frame of a slot."""
+        begin, count = self.span(slot)
+        return self._data[begin : begin + count].tobytes()
 
-    def restore(self, slot: int, encoded: bytes) -> None:
-        """Restore an encoded image from `read`, at the position in the slot's span."""
-        self._bytes(slot)[:] = np.frombuffer(encoded, np.uint8)
+    def write(self, slot: int, begin: int, encoded: bytes) -> None:
+        """Write the encoded frame of a slot from byte `begin` on."""
+        self._spans[slot] = begin, len(encoded)
+        self._data[begin : begin + len(encoded)] = np.frombuffer(encoded, np.uint8)
 
-    def go_on_after(self, slot: int | None) -> None:
-        """Write the next image after the image of a slot, or at position 0."""
-        self._head = 0 if slot is None else int(self._spans[slot].sum())
-
-    def stretch(
+    def byte_range(
         self, first: NDArray[np.int64], last: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return byte ranges; see `pictures.Pictures`."""
-        begin, (end, count) = self._spans[first, 0], self._spans[last].T
-        return self._ring_index.of(begin), self._ring_index.of(end) + count
+        """Return byte ranges; see `RawFrames.byte_range`."""
+        return self._spans[first, 0], self._spans[last].sum(axis=1)
 
-    def stacks(self, slots: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-        """Yield stacks, all decoded into the same array; see `pictures.Pictures`."""
-        frames = np.empty((slots.shape[1], *self.shape), np.uint8)
-        flat = list(frames.reshape(len(frames), -1))
+    def stacks(self, slots: NDArray[np.int64]) -> Iterator[NDArray[Any]]:
+        """Yield stacks, all decoded into the same array; see `RawFrames.stacks`."""
+        stack = np.empty((slots.shape[1], *self.field.shape), self.field.dtype)
+        flat = list(stack.reshape(len(stack), -1))
+        data, dtype, size = self._data.data, self.field.dtype, self.field.bytes
         for spans in self._spans[slots].tolist():
             for (begin, count), frame in zip(spans, flat, strict=True):
-                self._decode(begin, count, frame)
-            yield frames
+                packed = data[begin + 1 : begin + count]
+                difference = lz4.block.decompress(packed, uncompressed_size=size)
+                background = self.backgrounds[data[begin]]
+                np.add(np.frombuffer(difference, dtype), background, out=frame)
+            yield stack
 
-    def _decode(self, begin: int, count: int, out: NDArray[np.uint8]) -> None:
-        at, data = self._ring_index.of(begin), self._ring.data
-        difference = lz4.block.decompress(data[at + 1 : at + count], uncompressed_size=self._size)
-        np.add(np.frombuffer(difference, np.uint8), self.backgrounds[data[at]], out=out)
 
-    def _begin(self, count: int) -> int:
-        """Return the next position with `count` contiguous bytes."""
-        room = len(self._ring) - self._ring_index.of(self._head)
-        return self._head if count <= room else self._head + room
+class ByteRing:
+    """The bytes of the frames of one ring, written one after the other.
 
-    def _bytes(self, slot: int) -> NDArray[np.uint8]:
-        begin, count = self._spans[slot].tolist()
-        at = self._ring_index.of(begin)
-        return self._ring[at : at + count]
+    No frame crosses the end: one that does not fit there is written at the beginning.
+
+    Args:
+        frames: the frames of all rings.
+        begin: first byte of this ring.
+        length: number of bytes of this ring.
+    """
+
+    def __init__(self, frames: CompressedFrames, begin: int, length: int) -> None:
+        self._frames, self._begin, self._length = frames, begin, length
+        self._head = begin  # the byte after the newest frame
+
+    def overwrites(self, slot: int, encoded: bytes) -> bool:
+        """Return whether writing a frame next overwrites the oldest frame, which is in `slot`."""
+        free = (self._frames.span(slot)[0] - self._head) % self._length
+        return free < (self._place(encoded) + len(encoded) - self._head) % self._length
+
+    def write(self, slot: int, encoded: bytes) -> None:
+        """Write an encoded frame after the newest one."""
+        begin = self._place(encoded)
+        self._frames.write(slot, begin, encoded)
+        self._head = begin + len(encoded)
+
+    def continue_after(self, slot: int | None) -> None:
+        """Write the next frame after the frame of a slot, or at the beginning."""
+        self._head = self._begin if slot is None else sum(self._frames.span(slot))
+
+    def _place(self, encoded: bytes) -> int:
+        """Return the byte where a frame is written next."""
+        fits = self._head + len(encoded) <= self._begin + self._length
+        return self._head if fits else self._begin

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from merl.replay.config import ReplayConfig
+from merl.replay.spec import ReplaySpec, field_name
 
 
 @dataclass(frozen=True)
@@ -35,37 +35,38 @@ class SampleIndices:
 
 
 class Sampler:
-    """Computation of samples, from one ring or from several rings one after the other.
+    """Computation of samples from rings that are stored one after the other.
 
     Args:
-        fields: the arrays by name, with all rings one after the other; see `storage.fields_of`.
-        config: frame stack, n and discount.
+        fields: the arrays by name; see `ReplaySpec.fields`.
+        spec: what the replay stores, and how it is sampled.
+        slots: number of slots of each ring.
     """
 
-    def __init__(self, fields: Mapping[str, Tensor], config: ReplayConfig) -> None:
-        self._fields = fields
+    def __init__(self, fields: Mapping[str, Tensor], spec: ReplaySpec, slots: int) -> None:
+        self._fields, self._spec, self._slots = fields, spec, slots
+        config = spec.config
         device = fields["position"].device
         self._ahead = torch.arange(config.n_step, device=device)
         self._back = torch.arange(config.frame_stack - 1, -1, -1, device=device)
         powers = [config.discount**power for power in range(config.n_step + 1)]
         self._powers = torch.tensor(powers, dtype=torch.float64, device=device)
 
-    def pick(self, source: Tensor, newest: Tensor, base: Tensor, slots: Tensor) -> SampleIndices:
+    def pick(self, ring: Tensor, source: Tensor, newest: Tensor) -> SampleIndices:
         """Return slots and returns of the samples that start at timesteps `source`.
 
         Args:
+            ring: number of each sample's ring, int64 (B,).
             source: numbers of timesteps, int64 (B,); number 1 is in the first slot of its ring.
-            newest: newest timestep of each sample's ring, int64 (B,) or (1,).
-            base: first slot of each sample's ring, int64 (B,) or (1,).
-            slots: number of slots of each sample's ring, int64 (B,) or (1,).
+            newest: newest timestep of each sample's ring, int64 (B,).
         """
         fields, newest, timesteps = self._fields, newest[:, None], source[:, None]
-        base, length = base[:, None], slots[:, None]
+        base = ring[:, None] * self._slots
 
         def slot(timestep: Tensor) -> Tensor:
-            return (timestep - 1) % length + base
+            return (timestep - 1) % self._slots + base
 
-        begun = timesteps - fields["position"][slot(timesteps)]  # first timestep of the episode
+        start = timesteps - fields["position"][slot(timesteps)]  # first timestep of the episode
         ahead = timesteps + 1 + self._ahead  # (B, n): timesteps of r_t, r_{t+1}, ...
         led_to = slot(ahead)
         same = ((ahead <= newest) & (fields["position"][led_to] > 0)).long().cumprod(dim=1)
@@ -76,21 +77,25 @@ class Sampler:
         rewards = paid * self._powers[:-1]  # float64
         last = fields["discount"][slot(end)[:, 0]]
         return SampleIndices(
-            now=slot(torch.maximum(timesteps - self._back, begun)),
-            then=slot(torch.maximum(end - self._back, begun)),
+            now=slot(torch.maximum(timesteps - self._back, start)),
+            then=slot(torch.maximum(end - self._back, start)),
             action=led_to[:, 0],
             reward=rewards.sum(dim=1).float(),
             discount=(self._powers[steps] * last).float(),
         )
 
-    def observed(self, name: str, slots: Tensor) -> Tensor:
-        """Return the images at slots (B, K), (B, K, H, W, C), or the newest vectors, (B, n)."""
-        field = self._fields[name]
-        if field.dtype != torch.uint8:
-            return field.index_select(0, slots[:, -1])
-        if field.device.type == "cpu":  # there, NumPy takes half the time (docs/bench.md)
+    def observed(self, key: str, slots: Tensor) -> Tensor:
+        """Return the frames of a stacked key at slots (B, K), or the newest values, (B, *shape).
+
+        Rows are copied as bytes: torch cannot index all types, for example uint16.
+        """
+        field, spec = self._fields[field_name(key)], self._spec.keys[key]
+        if not spec.stacked:
+            slots = slots[:, -1]
+        if field.device.type == "cpu":  # there, NumPy takes half the time
             return torch.from_numpy(field.numpy().take(slots.numpy(), axis=0))
-        return field.index_select(0, slots.flatten()).view(*slots.shape, *field.shape[1:])
+        rows = field.view(len(field), -1).view(torch.uint8).index_select(0, slots.flatten())
+        return rows.view(field.dtype).view(*slots.shape, *spec.shape)
 
     def action(self, indices: SampleIndices) -> Tensor:
         """Return a_t, float32 (B, A)."""

@@ -83,25 +83,17 @@ def read_metrics(run: Path | str) -> dict[str, Array]:
     return {name: table[:, i] for i, name in enumerate(columns)}
 
 
-def curve(run: Path | str, name: str, x: str = "step") -> Curve:
+def curve_of(metrics: dict[str, Array], name: str, x: str = "step") -> Curve:
     """Return one column of a run over another, without rows in which either is empty.
 
     Args:
-        run: see `read_metrics`.
+        metrics: see `read_metrics`.
         name: the column for y, e.g. `eval/return`.
         x: the column for x, e.g. `time/seconds`.
 
     Returns:
         The curve, ascending in x; empty if the run does not have these columns yet.
-
-    Raises:
-        MerlError: see `read_metrics`.
     """
-    return curve_of(read_metrics(run), name, x)
-
-
-def curve_of(metrics: dict[str, Array], name: str, x: str = "step") -> Curve:
-    """Return the same as `curve`, from metrics that `read_metrics` returned."""
     empty = np.full(len(metrics["step"]), np.nan)
     steps, values = metrics.get(x, empty), metrics.get(name, empty)
     known = ~np.isnan(steps) & ~np.isnan(values)
@@ -109,27 +101,21 @@ def curve_of(metrics: dict[str, Array], name: str, x: str = "step") -> Curve:
     return Curve(steps[known][order], values[known][order])
 
 
-def aggregate(
-    curves: Sequence[Curve], grid: Array | None = None, band: Band = "range"
-) -> Aggregate:
-    """Aggregate the curves of several seeds on one grid.
+def aggregate(curves: Sequence[Curve], band: Band = "range") -> Aggregate:
+    """Aggregate the curves of several seeds: at all their steps in the range that all cover.
 
     Args:
         curves: one curve per seed, none of them empty; interpolated linearly between their points.
-        grid: x values at which to compare them, ascending, (G,); values outside the range that all
-            seeds cover are skipped. None: all steps of all seeds in that range.
         band: kind of the band around the mean; for one seed it has no width.
 
     Raises:
-        ValueError: no curve, an empty curve, or no grid step that all curves cover.
+        ValueError: no curve, an empty curve, or no step in the range that all curves cover.
     """
     if not curves or any(len(one.steps) == 0 for one in curves):
         raise ValueError("to aggregate seeds, give at least one curve, and none without points")
     begin = max(one.steps[0] for one in curves)
     end = min(one.steps[-1] for one in curves)
-    if grid is None:
-        grid = np.unique(np.concatenate([one.steps for one in curves]))
-    steps = np.asarray(grid, dtype=np.float64)
+    steps = np.unique(np.concatenate([one.steps for one in curves]))
     steps = steps[(begin <= steps) & (steps <= end)]
     if len(steps) == 0:
         raise ValueError("the curves of these seeds have no step in common")

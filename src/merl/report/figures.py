@@ -25,7 +25,6 @@ from merl.report.drawing import (
     DASHES,
     FAINT,
     GREEN,
-    INK,
     LABEL_SIZE,
     MUTED,
     PALETTE,
@@ -149,57 +148,6 @@ def learning_curves(
         note = f"bold: mean over the seeds; band: {around}; thin: each seed"
         axes.set_title(note, loc="left", color=MUTED, size=LABEL_SIZE)
     direct_labels(figure, axes, labels)
-    return save(figure, Path(output))
-
-
-def reward_terms(
-    runs: Mapping[str, Run],
-    output: Path | str,
-    *,
-    references: Mapping[str, Reference] | None = None,
-) -> Path:
-    """Draw the terms of the reward over training: one panel per run, one curve per term.
-
-    A curve shows the sum of a term over an evaluation episode, `eval/reward/TERM`.
-
-    Args:
-        runs: {label: run folder, or CSV file with the layout of `metrics.csv`}.
-        output: the figure's file.
-        references: {label of a run: {term: sum}}, e.g. the sums of an agent that does not move;
-            drawn as dotted lines in the colours of the terms.
-
-    Returns:
-        `output`.
-
-    Raises:
-        MerlError: a file is missing or malformed, the rewards of a run have no terms, or `output`
-            cannot be written.
-    """
-    if not runs:
-        raise MerlError("no run given to draw the reward of")
-    figure = new_figure(height=2.9 * len(runs))
-    panels = np.atleast_1d(figure.subplots(len(runs), 1))
-    labels: dict[Axes, list[Label]] = {}
-    for axes, (label, run) in zip(panels, runs.items(), strict=True):
-        metrics = read_metrics(run)
-        names = [name for name in metrics if name.startswith("eval/reward/")]
-        if not names:
-            raise MerlError(f"{label}: {run} has no terms of a reward (columns eval/reward/...)")
-        style(axes, "sum over an episode")
-        axes.set_title(label, loc="left", color=INK, size=LABEL_SIZE + 1, weight="bold")
-        labels[axes] = []
-        sums = (references or {}).get(label, {})
-        for name, color in zip(names, PALETTE, strict=False):
-            term, drawn = name.removeprefix("eval/reward/"), curve_of(metrics, name)
-            axes.plot(*drawn, color=color, lw=1.8)
-            if term in sums:
-                axes.axhline(sums[term], color=color, lw=1.0, ls=":", zorder=1.2)
-            last = drawn.values[-1]
-            labels[axes].append(Label(f"{term} {number(last)}", last, color, "bold"))
-        value_axis(axes, list(sums.values()), False)
-        step_axis(axes, metrics["step"])
-    for axes, of_axes in labels.items():
-        direct_labels(figure, axes, of_axes)
     return save(figure, Path(output))
 
 

@@ -1,7 +1,8 @@
 """Checkpoints: folders that are written atomically.
 
-`checkpoints/00010000/` holds `weights.safetensors` (networks and target), `learner.pt` (optimizers
-and random generators; read with `weights_only=True`), `state.json` (progress of the run) and
+`checkpoints/00010000/` holds `weights.safetensors` (the dicts of tensors in the agent's state),
+`learner.pt` (the rest of it, e.g. optimizers and random generators; read with `weights_only=True`),
+`state.json` (progress of the run) and
 `manifest.json` (sizes and SHA-256 of the other files). The folder is written under a temporary
 name, flushed to disk, then renamed.
 """
@@ -25,7 +26,6 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
-from torch import nn
 
 from merl.core import Agent, MerlError
 from merl.core.guards import check_weights
@@ -40,7 +40,6 @@ _WEIGHTS, _LEARNER, _STATE, _MANIFEST = (
 )
 _FILES = (_WEIGHTS, _LEARNER, _STATE)
 _BAD_VALUES = (ValueError, TypeError, AttributeError, RecursionError)
-_WEIGHT_GROUPS = ("networks", "critic_target")
 _CPU = torch.device("cpu")
 _LOG = logging.getLogger(__name__)
 
@@ -164,14 +163,15 @@ def save(
     """
     with torch_settings(_CPU):
         learnt = agent.state_dict()
-        check_weights({group: learnt[group] for group in _WEIGHT_GROUPS})
+        weights = {group: value for group, value in learnt.items() if _is_weights(group, value)}
+        check_weights(weights)
     root.mkdir(exist_ok=True)  # no parents: do not recreate a run folder that was deleted
     part = root / f".part-{step:08d}"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
         with torch_settings(_CPU):
-            _write(part, learnt, state)
+            _write(part, weights, learnt, state)
         names = (_WEIGHTS, _LEARNER, _STATE)
         manifest = {
             "format": FORMAT,
@@ -211,14 +211,14 @@ def load_agent(agent: Agent, checkpoint: Checkpoint) -> None:
         agent.load_state_dict({**_weights(checkpoint), **learner})
 
 
-def load_networks(networks: nn.Module, checkpoint: Checkpoint) -> None:
-    """Load the weights of a checkpoint into networks; it may come from another device.
+def load_policy_of(agent: Agent, checkpoint: Checkpoint) -> None:
+    """Restore an agent's policy to act only; the checkpoint may come from another device.
 
     Raises:
-        MerlError: a file cannot be read, or does not match the networks.
+        MerlError: a file cannot be read, or does not match the agent.
     """
     with readable(checkpoint), torch_settings(_CPU):
-        networks.load_state_dict(_weights(checkpoint)["networks"])
+        agent.load_policy(_weights(checkpoint))
 
 
 @contextmanager
@@ -270,27 +270,34 @@ def _learner(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def _weights(checkpoint: Checkpoint) -> dict[str, dict[str, torch.Tensor]]:
-    weights = load_file(checkpoint.path / _WEIGHTS)
-    return {
-        group: {
-            name.removeprefix(f"{group}."): tensor
-            for name, tensor in weights.items()
-            if name.startswith(f"{group}.")
-        }
-        for group in _WEIGHT_GROUPS
-    }
+    weights: dict[str, dict[str, torch.Tensor]] = {}
+    for whole, tensor in load_file(checkpoint.path / _WEIGHTS).items():
+        group, _, name = whole.partition(".")
+        weights.setdefault(group, {})[name] = tensor
+    return weights
 
 
-def _write(folder: Path, agent: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-    weights = {
+def _is_weights(group: str, value: Any) -> bool:
+    """Return whether a part of an agent's state is a dict of tensors, as of `nn.Module`."""
+    is_dict = isinstance(value, Mapping) and bool(value) and "." not in group
+    return is_dict and all(isinstance(tensor, torch.Tensor) for tensor in value.values())
+
+
+def _write(
+    folder: Path,
+    weights: Mapping[str, Mapping[str, torch.Tensor]],
+    agent: Mapping[str, Any],
+    state: Mapping[str, Any],
+) -> None:
+    flat = {
         f"{group}.{name}": tensor.detach().cpu().contiguous()
-        for group in _WEIGHT_GROUPS
-        for name, tensor in agent[group].items()
+        for group, tensors in weights.items()
+        for name, tensor in tensors.items()
     }
     learner = io.BytesIO()
-    torch.save({k: v for k, v in agent.items() if k not in _WEIGHT_GROUPS}, learner)
+    torch.save({key: value for key, value in agent.items() if key not in weights}, learner)
     # Write the bytes from Python, so that a full disk raises OSError for every format.
-    (folder / _WEIGHTS).write_bytes(to_bytes(weights))
+    (folder / _WEIGHTS).write_bytes(to_bytes(flat))
     (folder / _LEARNER).write_bytes(learner.getbuffer())
     (folder / _STATE).write_text(json.dumps(state))
 

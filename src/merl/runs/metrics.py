@@ -15,14 +15,13 @@ import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Self
 
 from merl.core import METRICS_FILE, MerlError
 
 _LOG = logging.getLogger(__name__)
 
 
-class MetricsFile:
+class MetricsFile(contextlib.AbstractContextManager["MetricsFile"]):
     """The file `metrics.csv` of a run, open for writing; a context manager.
 
     All rows are also held in memory (a few MB for the longest run). A new step is one `write` of
@@ -48,10 +47,6 @@ class MetricsFile:
         # Only here: a folder that is deleted during the run is not created again.
         self._guard(lambda: self._path.parent.mkdir(parents=True, exist_ok=True))
         self._guard(self._rewrite)
-
-    def __enter__(self) -> Self:
-        """Return the file."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Close the file, also after an exception."""

@@ -31,36 +31,30 @@ def from_plain(cls: type[T], plain: Mapping[str, Any], **narrower: type) -> T:
         **narrower: for a field that is annotated with a base class, the subclass to restore.
 
     Raises:
-        TypeError: a value does not have the type of its field, or a field is unknown. Unknown
-            fields are not ignored, since the run would then silently change.
+        TypeError: a field is unknown, or not an object. Unknown fields are not ignored, since the
+            run would then silently change.
+        MerlError: a value is rejected by the config.
     """
     hints = typing.get_type_hints(cls) | narrower
     for name in plain:
         if name not in hints:
             raise TypeError(f"{name} is unknown to this version of merl")
-    known = {name: _restore(name, hints[name], value) for name, value in plain.items()}
-    return cls(**known)
+    return cls(**{name: _restore(name, hints[name], value) for name, value in plain.items()})
 
 
 def _restore(name: str, hint: Any, value: Any) -> Any:
-    if isinstance(hint, types.UnionType):
+    """Restore a value; the config itself checks its type (`merl.core.fields`)."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
         if value is None:
             return None
-        hint = next(option for option in typing.get_args(hint) if option is not types.NoneType)
-    if dataclasses.is_dataclass(hint) and isinstance(value, dict):
+        hint = typing.get_args(hint)[0]
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise TypeError(f"{name} is {value!r}, not an object with its fields")
         return from_plain(typing.cast(type[Any], hint), value)
-    origin = typing.get_origin(hint) or hint
-    if origin is tuple and isinstance(value, list):
-        of = typing.get_args(hint)[0]
-        return tuple(_restore(name, of, part) for part in value)
-    if origin is Path and isinstance(value, str):
-        return Path(value)
-    plain: dict[Any, tuple[type, ...]] = {float: (int, float), typing.Literal: (str,)}
-    if not isinstance(value, plain.get(origin, (origin,))) or (
-        isinstance(value, bool) and origin is not bool
-    ):
-        raise TypeError(f"{name} is {value!r}, which is not of the type that merl writes")
-    return value
+    if typing.get_origin(hint) is tuple and isinstance(value, list):
+        return tuple(_restore(name, typing.get_args(hint)[0], part) for part in value)
+    return Path(value) if hint is Path else value
 
 
 def told(described: Mapping[str, Any]) -> str:

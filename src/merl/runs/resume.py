@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from merl.config import TrainConfig
+from merl.config import TrainConfig, flat, override
 from merl.core import MerlError
 
 HARMLESS = (
@@ -35,11 +35,16 @@ _LEFT_OPEN = {
     "threads": None,
     "agent.precision": "auto",
     "agent.torch_compile": "auto",
-    "agent.images": None,
-    "agent.vectors": None,
+    "agent.keys": None,
     "agent.critic_high": None,
 }
 """Values that leave a field open: merl chooses a value for this machine and records its choice."""
+_DECIDED = {
+    "device": "cpu",
+    "threads": 1,
+    "agent.precision": "fp32",
+    "agent.torch_compile": "no",
+}
 REOPENED = ("threads", "agent.precision", "agent.torch_compile")
 """Fields that are chosen again on another machine if the user left them open."""
 _NAMES = ("run_dir", "preset", "setting")
@@ -48,15 +53,15 @@ _NAMES = ("run_dir", "preset", "setting")
 
 def left_open(config: TrainConfig) -> tuple[str, ...]:
     """Return the names of the fields that a config leaves open."""
-    values = dict(_flat(config))
-    return tuple(name for name, value in _LEFT_OPEN.items() if values[name] == value)
+    values = flat(config)
+    return tuple(
+        name for name, value in _LEFT_OPEN.items() if name in values and values[name] == value
+    )
 
 
 def reopened(config: TrainConfig, names: Iterable[str] = REOPENED) -> TrainConfig:
     """Return a config in which the named fields are open again."""
-    for name in names:
-        config = _replaced(config, name, _LEFT_OPEN[name])
-    return config
+    return _with_known(config, {name: _LEFT_OPEN[name] for name in names})
 
 
 def decided(config: TrainConfig) -> TrainConfig:
@@ -64,15 +69,13 @@ def decided(config: TrainConfig) -> TrainConfig:
 
     The values are arbitrary.
     """
-    values = {
-        "device": "cpu",
-        "threads": 1,
-        "agent.precision": "fp32",
-        "agent.torch_compile": "no",
-    }
-    for name, value in values.items():
-        config = _replaced(config, name, value)
-    return config
+    return _with_known(config, _DECIDED)
+
+
+def _with_known(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
+    """Return a config with other values of the fields that it has; a user's agent lacks some."""
+    known = flat(config)
+    return override(config, {name: value for name, value in values.items() if name in known})
 
 
 def resume_request(
@@ -107,7 +110,7 @@ def merge_resume_config(
     Raises:
         MerlError: a change is not allowed on resume; the message names the fields.
     """
-    before, after = dict(_flat(recorded)), dict(_flat(asked))
+    before, after = flat(recorded), flat(asked)
     open_fields = left_open(asked)
     changed = {
         name: (before.get(name), after.get(name))
@@ -127,28 +130,8 @@ def merge_resume_config(
             f"run {recorded.run_dir} cannot resume with {', '.join(refused)}: keep the recorded "
             "value, or start a new run with another --run-dir"
         )
-    config = recorded
-    for name in changed:
-        config = _replaced(config, name, after[name])
-    config = dataclasses.replace(config, minutes=asked.minutes)
-    return config, list(as_text.values())
-
-
-def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted name and value of every field, including nested configs."""
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _flat(value, f"{prefix}{field.name}.")
-        else:
-            yield f"{prefix}{field.name}", value
-
-
-def _replaced(config: Any, name: str, value: Any) -> Any:
-    first, _, rest = name.partition(".")
-    if rest:
-        value = _replaced(getattr(config, first), rest, value)
-    return dataclasses.replace(config, **{first: value})
+    applied = {name: after[name] for name in changed} | {"minutes": asked.minutes}
+    return override(recorded, applied), list(as_text.values())
 
 
 def _format(value: Any) -> str:

@@ -37,8 +37,8 @@ def run_path(config: TrainConfig, home: Path | None = None) -> Path:
     if config.run_dir is not None:
         return home / config.run_dir
     agent = config.agent_name if config.setting == "matched" else f"{config.agent_name}-published"
-    task = re.sub(r"[^\w.-]+", "-", config.task)  # `module:function`, `namespace/Id-v0`
-    name = f"{task}-{agent}-{config.preset}-s{config.seed}"
+    name = f"{config.task}-{agent}-{config.preset}-s{config.seed}"
+    name = re.sub(r"[^\w.-]+", "-", name)  # `module:function`, `namespace/Id-v0`
     runs = home / "runs"
     numbered = (runs / f"{name}-{number}" for number in itertools.count(2))
     return next(p for p in itertools.chain([runs / name], numbered) if not _exists(p))

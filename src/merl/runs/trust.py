@@ -1,10 +1,10 @@
-"""Records of the runs that this user has trained: only their environments may be imported.
+"""Records of the runs that this user has trained: only their code may be imported.
 
-A run folder can come from anyone, and importing the environment that it names would run code. An
-environment of merl or Gymnasium is always allowed. Any other environment is imported only if a
+A run folder can come from anyone, and importing the environment, the agent or an encoder that it
+names would run code. Those of merl and Gymnasium are always allowed. Others are imported only if a
 record outside of the run folder shows that this user trained the run. The record is a file whose
-name is the random id of the run; it holds the task and the folder of its module. The task and
-folder in `config.json` are not trusted.
+name is the random id of the run; it holds the names and the folders of their modules. The names and
+folders in `config.json` are not trusted.
 """
 
 from __future__ import annotations
@@ -23,28 +23,37 @@ from typing import Any
 from merl.core import MerlError
 from merl.envs.user_env import imports_code
 
+ENVIRONMENT = "environment"
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The origin of the environment of a run.
+    """The origin of the code of a run.
 
     Attributes:
-        task: `module:function` or `module:Id-v0`, or the id of a Gymnasium environment.
-        folder: the folder of the module; None if the module is installed.
+        names: see `names`.
+        folders: the folder of the module of each name; none for a module that is installed.
     """
 
-    task: str
-    folder: str | None
+    names: Mapping[str, str]
+    folders: Mapping[str, str]
+
+    def code(self) -> dict[str, str]:
+        """Describe the code that would be imported, with control characters escaped.
+
+        Returns:
+            Descriptions with the keys of `names`; only of code that is not merl's or Gymnasium's.
+        """
+        return {
+            what: _describe(name, self.folders.get(name))
+            for what, name in self.names.items()
+            if (imports_code(name) if what == ENVIRONMENT else ":" in name)
+        }
 
     def __str__(self) -> str:
-        """Describe the code that would be imported, with control characters escaped."""
-        module, colon, name = self.task.partition(":")
-        if not colon:
-            return f"Gymnasium environment {self.task!r}"
-        where = "installed" if self.folder is None else f"in folder {self.folder!r}"
-        return f"{name!r} of module {module!r}, {where}"
+        """Return the descriptions of `code`."""
+        return " and ".join(self.code().values())
 
 
 def identity(known: Any = None) -> str:
@@ -52,20 +61,39 @@ def identity(known: Any = None) -> str:
     return known if _is_identity(known) else uuid.uuid4().hex
 
 
-def origin(record: Mapping[str, Any]) -> Origin:
-    """Read the origin of the environment from the record of a run (`config.json`).
+def names(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a recorded config names: its "environment", "agent", and "encoder of KEY".
 
     Raises:
-        TypeError: task or folder is not a string.
+        TypeError: a name is not a string.
     """
-    task, folder = record["config"]["task"], record.get("module_folder")
-    if not isinstance(task, str) or not isinstance(folder, str | None):
-        raise TypeError(f"task is {task!r} and module_folder {folder!r}")
-    return Origin(task, folder)
+    found = {ENVIRONMENT: config["task"], "agent": config["agent_name"]}
+    encoders = config["agent"].get("encoders")  # another agent may have no such field
+    if isinstance(encoders, dict):
+        found |= {f"encoder of {key!r}": name for key, name in encoders.items()}
+    _check_strings(found)
+    return found
+
+
+def origin(record: Mapping[str, Any]) -> Origin:
+    """Read the origin of a run's code from the record of the run (`config.json`).
+
+    Raises:
+        TypeError: a name or a folder is not a string.
+    """
+    folders = record["module_folders"]
+    _check_strings(folders)
+    return Origin(names(record["config"]), folders)
+
+
+def _check_strings(values: Mapping[str, Any]) -> None:
+    for key, value in values.items():
+        if not isinstance(value, str):
+            raise TypeError(f"{key} is {value!r}, not a string")
 
 
 def remember(record: Mapping[str, Any]) -> None:
-    """Record that this user trains a run, if its environment imports code.
+    """Record that this user trains a run, if the run imports code.
 
     If the record cannot be written, log a warning.
 
@@ -73,7 +101,7 @@ def remember(record: Mapping[str, Any]) -> None:
         record: the content of the run's `config.json`.
     """
     stated, name = origin(record), record["id"]
-    if not imports_code(stated.task):
+    if not stated.code():
         return
     try:
         folder = _folder()
@@ -97,7 +125,7 @@ def check(run: Path, record: Mapping[str, Any]) -> Origin:
         record: the content of its `config.json`.
 
     Raises:
-        MerlError: this user has no record of the run, or the record names another environment.
+        MerlError: this user has no record of the run, or the record names other code.
     """
     stated = origin(record)
     try:
@@ -105,15 +133,23 @@ def check(run: Path, record: Mapping[str, Any]) -> Origin:
     except OSError as error:
         reason = f"your records of runs cannot be read ({error})"
     else:
-        if recorded is not None and recorded.task == stated.task:
+        if recorded is not None and recorded.names == stated.names:
             return recorded
         reason = "you have no record of training it here"
         if recorded is not None:
             reason = f"you trained it with {recorded}, and its config.json was changed since then"
     raise MerlError(
-        f"{run} names code as its environment: {stated}. It is not imported, because {reason}: "
-        "read that code, then add --trust (in Python: make_env(trust=True))"
+        f"{run} names code as its {' and '.join(stated.code())}: {stated}. It is not imported, "
+        f"because {reason}: read that code, then add --trust (in Python: trust=True)"
     )
+
+
+def _describe(named: str, folder: str | None) -> str:
+    module, colon, name = named.partition(":")
+    if not colon:
+        return f"Gymnasium environment {named!r}"
+    where = "installed" if folder is None else f"in folder {folder!r}"
+    return f"{name!r} of module {module!r}, {where}"
 
 
 def _is_identity(value: Any) -> bool:

@@ -22,7 +22,7 @@ BOX_MASS = 0.1
 """Mass of the box, kg."""
 DISC_CENTER = (0.0, -0.06)
 """Centre of the disc, x and y, m. It is closer to the camera than the centre of the workspace, so
-that the disc hides most of the objects there from the camera (docs/tasks.md)."""
+that the disc hides most of the objects there from the camera (docs/explanation/tasks.md)."""
 DISC_HEIGHT = (0.135, 0.150)
 """Heights of the lower and the upper face of the disc above the floor, m."""
 AROUND_BOX = Box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.02))

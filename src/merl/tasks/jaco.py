@@ -31,6 +31,8 @@ CAMERA = cameras.FRONT_CLOSE
 
 ProprioSet = Literal["paper", "full"]
 StateSet = Literal["absolute", "relative"]
+TOUCH_SIZE = 7
+"""Number of touch sensors: the palm, and for each finger its first link and its tip."""
 PROPRIO_SIZES: dict[ProprioSet, int] = {"paper": 24, "full": 42}
 """Number of values in each set of proprioception; see `JacoTask.proprio`."""
 _POSE_AND_VELOCITY = ("position", "orientation", "linear_velocity", "angular_velocity")
@@ -83,6 +85,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         self, prop: composer.Entity, prop_height: float = 0.0, target: Position | None = None
     ) -> None:
         self.target = None if target is None else np.array(target)
+        self._touch_sensors: list[Any] = []
         self._arena = arenas.Standard()
         self.arm = kinova.JacoArm()
         self.hand = kinova.JacoHand(use_pinch_site_as_tcp=True)
@@ -105,6 +108,15 @@ class JacoTask(composer.Task):  # type: ignore[misc]
             quaternion=workspaces.uniform_z_rotation,
             settle_physics=True,
         )
+
+    def add_touch_sensors(self) -> None:
+        """Add MuJoCo's touch sensors to the hand, for `touch`; call this before `compile`."""
+        model = self.hand.mjcf_model
+        names = ["hand", *(f"b_finger{part}_{n}" for n in (1, 2, 3) for part in ("", "_tip"))]
+        for name in names:
+            # A sensor adds the forces on its site's body within the site, an invisible sphere.
+            site = model.find("body", name).add("site", size=[0.2], group=4, rgba=[0, 0, 0, 0])
+            self._touch_sensors.append(model.sensor.add("touch", site=site, name=f"touch_{name}"))
 
     @property
     def root_entity(self) -> composer.Entity:
@@ -146,6 +158,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
         self._prop_body = int(physics.bind(self._prop_frame).element_id)
         sensors = [self.prop.mjcf_model.find("sensor", name) for name in _POSE_AND_VELOCITY]
         self._prop_sensors = _sensor_slice(physics, sensors)
+        self._touch = _sensor_slice(physics, self._touch_sensors) if self._touch_sensors else None
 
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
@@ -194,7 +207,7 @@ class JacoTask(composer.Task):  # type: ignore[misc]
             physics: the simulation.
             which: `paper`: sine and cosine of each arm joint's angle (12), the arm's joint
                 velocities in rad/s (6), the fingers' joint angles in rad (3) and velocities in
-                rad/s (3). `full`: also the arm's joint torques (6) as sign(x) log(1 + |x|) of
+                rad/s (3). `full`: also the arm's joint torques (6), sign(x) log(1 + abs(x)) of
                 N m, and the pinch site's position in m (3) and rotation matrix (9).
 
         Returns:
@@ -217,6 +230,18 @@ class JacoTask(composer.Task):  # type: ignore[misc]
                 data.site_xmat[self._tcp],
             ]
         return np.concatenate(parts, dtype=np.float32, casting="same_kind")
+
+    def touch(self, physics: mjcf.Physics) -> Float32:
+        """Return the contact forces on the hand.
+
+        Returns:
+            float32 (7,): log(1 + F) of the normal force F in N on the palm, and for each of the
+            three fingers on its first link and its tip. All zeros without `add_touch_sensors`.
+        """
+        if self._touch is None:
+            return np.zeros(TOUCH_SIZE, np.float32)
+        forces: Float32 = np.log1p(physics.data.sensordata[self._touch]).astype(np.float32)
+        return forces
 
     def state(self, physics: mjcf.Physics, which: StateSet = "absolute") -> Float32:
         """Return the full state of the task, for agents without a camera.

@@ -93,7 +93,7 @@ def lift(
     """Return the terms of Eq. 5: raise the object to a target in the air, hand pointing down.
 
     The last row of Eq. 5 depends only on the object's height. Here the hand must also be at the
-    object, as in the authors' later code (docs/paper.md): a thrown box does not count as lifted.
+    object, as in the authors' later code (docs/explanation/paper.md): a thrown box is not lifted.
 
     Args:
         hand_distance: distance from the tool centre point to the object, m.

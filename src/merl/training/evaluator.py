@@ -7,7 +7,7 @@ from collections.abc import Callable
 from merl.callbacks import Callback
 from merl.core import EvaluationFailed, MerlError
 from merl.core.signals import Interrupt
-from merl.envs.wrappers import in_one_line
+from merl.core.user_code import in_one_line
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.policy import Policy
 from merl.runs.run import Run

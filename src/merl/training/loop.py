@@ -20,7 +20,7 @@ from torch import Tensor
 from merl.acting.environments import Environments, WorkerDied
 from merl.acting.rollout import Episode, Fetched, FrameStack, side_by_side
 from merl.config import TrainConfig
-from merl.core import Agent, Transition
+from merl.core import Agent, MerlError, Transition
 from merl.core.guards import check_finite
 from merl.replay import ReplayBuffer
 
@@ -59,8 +59,9 @@ class StepResult:
     lost: str | None = None
 
 
-Update = Callable[[], dict[str, Tensor]]
-"""A function that makes one update and returns its metrics, scalars on the device."""
+Update = Callable[[int], dict[str, Tensor]]
+"""A function that makes one update and returns its metrics, scalars on the device. Its argument is
+the number of environment steps before the current one, on which schedules depend."""
 
 
 class Randomness:
@@ -140,12 +141,12 @@ def train(
     stopping = is_to_stop if config.synchronous else lambda: False
     learn = partial(_learn, update, progress, config, stopping)
     # First make the updates that were due when the run was stopped.
-    agent.step = max(0, progress.step - config.action_repeat * collector.count)
-    remaining = learn() if config.synchronous else {}
+    step = max(0, progress.step - config.action_repeat * collector.count)
+    remaining = learn(step) if config.synchronous else {}
     if remaining or stopping():
         yield StepResult(progress.step, progress.updates, remaining)
     while progress.step < config.steps:
-        agent.step = progress.step
+        step = progress.step
         learning: dict[str, Tensor] = {}
         try:
             collector.begin_episodes(randomness, progress)
@@ -154,17 +155,17 @@ def train(
             # GPU before waiting for the actions, so that the GPU never idles.
             launched = actions.under_way and not config.synchronous
             if launched:
-                learning = learn()
+                learning = learn(step)
             collector.act(actions.wait().numpy())
             if not (launched or config.synchronous):
-                learning = learn()
+                learning = learn(step)
             ended = collector.store(progress, config.action_repeat)
         except WorkerDied as died:
             collector.broken = True
             yield StepResult(progress.step, progress.updates, learning, lost=str(died))
             continue
         if config.synchronous or progress.step >= config.steps:
-            learning = learn() or learning
+            learning = learn(step) or learning
         progress.episodes += len(ended)
         yield StepResult(progress.step, progress.updates, learning, ended)
 
@@ -218,8 +219,7 @@ class Collector:
             return
         for index, observation in self.environments.reset(starting).items():
             check_finite(observation, 0.0, progress.step, self._where(index))
-            self.replay.rings[index].begin(observation)
-            self.stacks[index].reset(observation)
+            self.replay.begin(self.stacks[index].reset(observation), index)
             self._episodes[index] = Episode()
 
     def act(self, actions: NDArray[np.float32]) -> None:
@@ -236,10 +236,9 @@ class Collector:
             check_finite(step.observation, step.reward, reached, self._where(index))
             over = bool(step.terminated or step.truncated)
             discount = 0.0 if step.terminated else 1.0
-            self.replay.rings[index].add(
-                Transition(self._actions[index], step.reward, discount, step.observation, over)
-            )
-            self.stacks[index].push(step.observation)
+            stored = self.stacks[index].push(step.observation)
+            transition = Transition(self._actions[index], step.reward, discount, stored, over)
+            self.replay.add(transition, index)
             self._episodes[index].add(step.reward, step.info)
             progress.step += repeat
             if over:
@@ -263,7 +262,14 @@ def _actions(
         shape = (collector.count, *collector.environments.action_shape)
         drawn = randomness.actions.uniform(-1.0, 1.0, shape).astype(np.float32)
         return Fetched(torch.from_numpy(drawn))
-    return Fetched(agent.act(side_by_side(collector.stacks), explore=True).float())
+    actions = agent.act(side_by_side(collector.stacks), explore=True, step=progress.step)
+    expected = (collector.count, *collector.environments.action_shape)
+    if actions.shape != expected:
+        raise MerlError(
+            f"act() of agent {config.agent_name!r} returned shape {tuple(actions.shape)}: return "
+            f"{expected}, one action for each environment"
+        )
+    return Fetched(actions.float())
 
 
 def updates_due(steps: int, updates_per_step: float) -> int:
@@ -272,12 +278,16 @@ def updates_due(steps: int, updates_per_step: float) -> int:
 
 
 def _learn(
-    update: Update, progress: Progress, config: TrainConfig, is_to_stop: Callable[[], bool]
+    update: Update,
+    progress: Progress,
+    config: TrainConfig,
+    is_to_stop: Callable[[], bool],
+    step: int,
 ) -> dict[str, Tensor]:
     """Make the updates that are due: after step t, (t - seed_steps) * updates_per_step in total."""
     due = updates_due(progress.step - config.seed_steps, config.updates_per_step)
     metrics: dict[str, Tensor] = {}
     while progress.updates < due and not is_to_stop():
-        metrics |= update()
+        metrics |= update(step)
         progress.updates += 1
     return metrics

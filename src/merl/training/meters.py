@@ -54,25 +54,25 @@ class Clock:
 
     def seconds(self) -> float:
         """Return the wall-clock time of training in seconds, without interruptions."""
-        return self._before + self.stretch()
+        return self._before + self.seconds_since_start()
 
     def cpu_seconds(self) -> float:
         """Return the processor time of training in seconds, of all threads."""
         return self._cpu_before + time.process_time() - self._cpu_start
 
-    def stretch(self) -> float:
+    def seconds_since_start(self) -> float:
         """Return the wall-clock seconds since start or resume."""
         return time.perf_counter() - self._start
 
     def mark(self, progress: Progress) -> None:
         """Start to measure the next rates."""
-        self._mark = (self.stretch(), progress.step, progress.updates)
+        self._mark = (self.seconds_since_start(), progress.step, progress.updates)
 
     def rates(self, progress: Progress) -> dict[str, float]:
         """Return the time, and steps and updates per second since the last mark; set a mark."""
         start, steps, updates = self._mark
         self.mark(progress)
-        span = max(self.stretch() - start, 1e-9)
+        span = max(self.seconds_since_start() - start, 1e-9)
         return {
             "time/seconds": self.seconds(),
             "time/cpu_seconds": self.cpu_seconds(),

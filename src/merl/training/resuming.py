@@ -55,12 +55,12 @@ def resumption(
         asked: the requested config; fields that it leaves open keep their recorded values.
         given_open: fields that the user explicitly left open, as with `--agent.precision auto`.
         imports: whether to import the environment that the run names.
-        trusted: whether that environment may be imported; see `Run.load_module`.
-        named_in: the folder in which the user named the task.
+        trusted: whether the code that the run names may be imported; see `Run.load_module`.
+        named_in: the folder in which the user named the task and the agent.
 
     Raises:
         MerlError: the config would make it another run, another process trains it, its checkpoint
-            or replay is missing, or its environment is not trusted.
+            or replay is missing, or its code is not trusted.
     """
     if asked.device == "auto" and "device" in given_open:
         asked = dataclasses.replace(asked, device=device_name("auto"))
@@ -75,6 +75,7 @@ def resumption(
     with run.lock():
         if imports:
             run.load_module(trusted=trusted, named_in=named_in)
+        run.load_encoders(trusted=trusted, named_in=named_in)
         if run.begin_again():
             what = f"run {run.path}, which was stopped before its first step, starts again"
             yield Resumption(run, config, None, None, what)

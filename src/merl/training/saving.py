@@ -104,7 +104,7 @@ class Saver:
         finally:
             self.interval.saved(within_episode)
         self._saved = dataclasses.asdict(progress)
-        self._replay.settle()
+        self._replay.confirm_checkpoint()
         self._callbacks.on_checkpoint(progress.step)
         return True
 

@@ -14,24 +14,23 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
+from merl.accelerate.networks import speed_up
 from merl.acting.env_checks import check_instances
-from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces
+from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
 from merl.acting.workers import check_sendable
 from merl.agents import make_agent
-from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG
-from merl.agents.networks import make_networks
+from merl.agents.config import AgentConfig, ObservationConfig
+from merl.agents.networks import make_networks, own_encoders
 from merl.config import TrainConfig
-from merl.core import MerlError, counted
+from merl.core import Agent, MerlError, counted, user_code
 from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.user_env import MakeEnv, load_module
 from merl.evaluation.video import MIN_SIDE
-from merl.networks.settings import torch_settings
-from merl.replay import ReplayBuffer, check_fits
+from merl.replay import ReplaySpec, check_fits
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
 from merl.training.loop import Progress, Randomness
-from merl.training.timing import measure, use_threads
+from merl.training.timing import measure
 
 
 class Setup:
@@ -47,8 +46,10 @@ class Setup:
         eval_env: the environment for evaluation; None without evaluations (`eval.every` is 0).
         home: the working folder at the start; a relative run folder is relative to it.
         records_video: whether `eval_env` renders images.
+        spec: what the agent observes.
         space: the observation space, with the keys that the agent uses.
         action_space: the action space.
+        replay_spec: what the replay stores.
         device: device of the networks.
         agent: the learner.
         progress: counts of steps, updates and episodes.
@@ -61,10 +62,13 @@ class Setup:
         env: gymnasium.Env[Any, Any],
         eval_env: gymnasium.Env[Any, Any] | None,
         home: Path,
+        replay_spec: ReplaySpec,
         make: MakeEnv | None,
     ) -> None:
         self.env, self.eval_env, self.home, self.make = env, eval_env, home, make
+        self.replay_spec = replay_spec
         self.records_video = eval_env is not None and eval_env.render_mode == "rgb_array"
+        self.spec = run_spec(config, env)
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
         bounded(config.agent, config.replay.discount)  # reject bad values before timing
@@ -77,7 +81,7 @@ class Setup:
         self.left_open = left_open(config)
         self.timing = measure(timed, env, eval_env or env, self.space, self.device)
         best = self.timing.best
-        use_threads(best.threads)
+        torch.set_num_threads(best.threads)
         self.config = dataclasses.replace(
             config,
             threads=best.threads,
@@ -85,7 +89,8 @@ class Setup:
             agent=bounded(best.decided(config.agent), config.replay.discount),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
-        self.agent: DDPG = make_agent(
+        self.agent: Agent = make_agent(
+            config.agent_name,
             self.config.agent,
             self.space,
             self.action_space,
@@ -94,19 +99,7 @@ class Setup:
             device=self.device,
             threads=best.threads,
         )
-
-    def open_replay(self, directory: Path) -> ReplayBuffer:
-        """Open the replay buffer of the run in a folder, which is empty if the run is new."""
-        config = self.config
-        with torch_settings(self.device):
-            return ReplayBuffer(
-                config.replay,
-                self.space,
-                self.action_space,
-                count=config.num_envs,
-                directory=directory,
-                capacity=config.capacity,
-            )
+        speed_up(self.agent)
 
     @classmethod
     @contextmanager
@@ -118,7 +111,7 @@ class Setup:
         Args:
             config: the config of the run.
             new: whether the run is new: its folder must not exist, its replay must fit, and the
-                module of a user's environment may be in the working folder.
+                modules of the user's environment and encoders may be in the working folder.
             make: makes the environment, if the config does not name it.
 
         Raises:
@@ -137,21 +130,21 @@ class Setup:
             refuse_existing(run_path(config, home))
             if config.own_env and ":" in config.task and make is None:
                 load_module(config.task, home)
+            for name in own_encoders(config.agent):
+                user_code.load_module(name, home, kind="encoder")
         if config.has_workers:
             check_sendable(config, make)
         with ExitStack() as stack:
             env = make_run_env(config, make)
             stack.callback(env.close)
-            space, actions = run_spaces(config, env)
+            replay_spec = ReplaySpec.of(
+                config.replay,
+                *run_spaces(config, env),
+                capacity=config.capacity,
+                rings=config.num_envs,
+            )
             if new:
-                check_fits(
-                    config.replay,
-                    space,
-                    actions,
-                    directory=run_path(config, home),
-                    capacity=config.capacity,
-                    rings=config.num_envs,
-                )
+                check_fits(replay_spec, run_path(config, home))
             eval_env = None
             if config.eval.every:
                 size = max(config.env.render_size, MIN_SIDE)
@@ -163,16 +156,18 @@ class Setup:
                 expected.check(EnvSpaces.of(config, eval_env), "the one for evaluations")
                 if config.own_env:
                     check_instances(env, eval_env)
-            yield cls(config, env, eval_env, home, make)
+            yield cls(config, env, eval_env, home, replay_spec, make)
 
 
-def bounded(agent: AgentConfig, discount: float) -> AgentConfig:
+def bounded(agent: ObservationConfig, discount: float) -> ObservationConfig:
     """Return the config with a value of `critic_high`, if its critic predicts a histogram.
 
     Raises:
         MerlError: the discount gives no bound of the returns, or one that is not above
             `critic_low`.
     """
+    if not isinstance(agent, AgentConfig):
+        return agent
     if agent.critic_loss == "mse" or agent.critic_high is not None:
         return agent
     if discount == 1.0:
@@ -213,11 +208,13 @@ def check_memory(config: TrainConfig, space: spaces.Dict, action_space: spaces.B
     Raises:
         MerlError: the networks or the batch are too large.
     """
-    with torch.device("meta"):
-        networks = make_networks(
-            config.agent, space, action_space.shape[0], config.replay.frame_stack
-        )
-    weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
+    weights = 0
+    if isinstance(config.agent, AgentConfig):
+        with torch.device("meta"):
+            networks = make_networks(
+                config.agent, space, action_space.shape[0], config.replay.frame_stack
+            )
+        weights = 5 * 4 * sum(parameter.numel() for parameter in networks.parameters())
     stack, size = config.replay.frame_stack, config.replay.batch_size
     inputs = 2 * 5 * size * sum(math.prod(s.shape or ()) * stack for s in space.values())
     available = available_memory()

@@ -12,22 +12,24 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from statistics import median
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import gymnasium
 import torch
 from gymnasium import spaces
 
+from merl.accelerate.networks import speed_up
+from merl.accelerate.recording import Recorded
 from merl.agents import make_agent
-from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG
+from merl.agents.config import AgentConfig, ObservationConfig
 from merl.config import TrainConfig
-from merl.core import Batch, MerlError, counted, is_image
+from merl.core import Accelerable, Agent, Batch, MerlError, counted
+from merl.modalities import modalities_of
 from merl.networks.settings import torch_settings
 from merl.training.loop import Update
-from merl.training.updating import Recorded
+
+Config = TypeVar("Config", bound=ObservationConfig)
 
 REPEATS = 3
 """Number of measurements; their median is the result."""
@@ -64,8 +66,10 @@ class Arithmetic:
         precision = BF16_PAYS if self.precision == "bf16" else 1.0
         return precision * (THREADS_PAY if self.threads > 1 else 1.0)
 
-    def decided(self, config: AgentConfig) -> AgentConfig:
-        """Return the config with this precision and compilation."""
+    def decided(self, config: Config) -> Config:
+        """Return the config with this precision and compilation, if the agent is merl's."""
+        if not isinstance(config, AgentConfig):
+            return config
         torch_compile: Literal["yes", "no"] = "yes" if self.compiled else "no"
         return dataclasses.replace(config, precision=self.precision, torch_compile=torch_compile)
 
@@ -135,37 +139,38 @@ def measure(
     Raises:
         MerlError: the config asks for a compiled update, and compilation fails.
     """
-    asked, cores = config.agent.precision, len(os.sched_getaffinity(0))
+    cores = len(os.sched_getaffinity(0))
     threads = config.threads or (cores if device.type == "cuda" else 1)
-    precisions: tuple[Literal["fp32", "bf16"], ...] = (
-        ("fp32", "bf16") if asked == "auto" else (asked,)
-    )
+    precisions: tuple[Literal["fp32", "bf16"], ...] = ("fp32",)
+    compiled = False
+    if isinstance(config.agent, AgentConfig):
+        asked, compiled = config.agent.precision, config.agent.torch_compile == "yes"
+        precisions = ("fp32", "bf16") if asked == "auto" else (asked,)
     assert isinstance(env.action_space, spaces.Box)
     with torch_settings(device):
         batch = random_batch(config, space, env.action_space)  # on the host, like replay batches
     update: dict[Arithmetic, float] = {}
 
-    def attempt(arithmetic: Arithmetic) -> DDPG:
-        use_threads(arithmetic.threads)
+    def attempt(arithmetic: Arithmetic) -> Agent:
+        torch.set_num_threads(arithmetic.threads)
         try:
             with torch_settings(device):
                 agent = _agent(config, space, batch, device, arithmetic)
-                update[arithmetic] = _time_update(agent, batch)
+                update[arithmetic] = _time_update(agent, batch, device, _cycle(config.agent))
         except Exception as error:
             if arithmetic.compiled:
                 raise _CompileError(error) from error
             raise
         return agent
 
-    compiled = config.agent.torch_compile == "yes"
     for precision in precisions:
         agent = attempt(Arithmetic(precision, threads, compiled))
     fastest = Timing(update, 0.0).best
     if config.threads is None and cores > threads:
         attempt(dataclasses.replace(fastest, threads=cores))
-    use_threads(threads)
+    torch.set_num_threads(threads)
     with torch_settings(device):
-        step, frame = _time_acting(agent, batch), 0.0
+        step, frame = _time_acting(agent, batch, device), 0.0
     if not config.own_env:
         makes_videos = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
         frame = _time_frame(eval_env) if makes_videos else 0.0
@@ -184,15 +189,11 @@ def measure(
 def worth_compiling(config: TrainConfig, timing: Timing, device: torch.device) -> bool:
     """Return whether to try a compiled update: on a GPU, for a long run, if the config allows it.
 
-    On a CPU a compiled update was never faster (docs/bench.md).
+    On a CPU a compiled update was never faster (docs/explanation/benchmarks.md).
     """
-    left_open = config.agent.torch_compile == "auto"
+    agent = config.agent
+    left_open = isinstance(agent, AgentConfig) and agent.torch_compile == "auto"
     return left_open and device.type == "cuda" and timing.seconds(config) > WORTH_COMPILING
-
-
-def use_threads(count: int) -> None:
-    """Use `count` processor threads in this process."""
-    torch.set_num_threads(count)
 
 
 def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -> Batch:
@@ -201,14 +202,10 @@ def random_batch(config: TrainConfig, space: spaces.Dict, actions: spaces.Box) -
     size, stack = config.replay.batch_size, config.replay.frame_stack
 
     def observation() -> dict[str, torch.Tensor]:
-        return {key: modality(box) for key, box in space.items()}
-
-    def modality(box: spaces.Space[Any]) -> torch.Tensor:
-        assert box.shape is not None
-        if is_image(box):
-            shape = (size, stack, *box.shape)
-            return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
-        return torch.randn((size, *box.shape), generator=generator)
+        return {
+            key: modality.random(size, stack, generator)
+            for key, modality in modalities_of(space).items()
+        }
 
     return Batch(
         observation(),
@@ -225,8 +222,9 @@ def _agent(
     batch: Batch,
     device: torch.device,
     arithmetic: Arithmetic,
-) -> DDPG:
-    return make_agent(
+) -> Agent:
+    agent = make_agent(
+        config.agent_name,
         arithmetic.decided(config.agent),
         space,
         spaces.Box(-1.0, 1.0, batch.action.shape[1:]),
@@ -234,23 +232,28 @@ def _agent(
         seed=0,
         device=device,
     )
+    speed_up(agent)
+    return agent
 
 
-def _time_update(agent: DDPG, batch: Batch) -> float:
-    update: Update = partial(agent.update, batch)
+def _cycle(config: ObservationConfig) -> int:
+    """Return the number of updates of which one includes the actor."""
+    return config.actor_every if isinstance(config, AgentConfig) else 1
+
+
+def _time_update(agent: Agent, batch: Batch, device: torch.device, cycle: int) -> float:
+    update: Update = lambda step: agent.update(batch, step=step)  # noqa: E731
     warm_up, repeats = 1, REPEATS  # the first update also initialises, e.g. the optimizers
-    if agent.device.type == "cuda":  # time the kind of update that training uses there
-        on_device = batch.to(agent.device)
+    if device.type == "cuda" and isinstance(agent, Accelerable):  # as in training
+        on_device = batch.to(device)
         update, repeats = Recorded(agent, lambda: on_device), REPEATS_ON_GPU
         warm_up = Recorded.WARM_UP + 1
 
-    # Not every update includes the actor: time a whole cycle of updates.
-    cycle = agent.config.actor_every
-
     def updates() -> None:
         for _ in range(cycle):
-            metrics = update()
-        float(metrics["critic_loss"])  # reading it waits for the device
+            metrics = update(0)
+        for value in metrics.values():
+            float(value)  # reading it waits for the device
 
     for _ in range(warm_up):
         updates()
@@ -268,11 +271,11 @@ class _CompileError(MerlError):
         )
 
 
-def _time_acting(agent: DDPG, batch: Batch) -> float:
-    one = {key: value[:1].to(agent.device) for key, value in batch.observation.items()}
+def _time_acting(agent: Agent, batch: Batch, device: torch.device) -> float:
+    one = {key: value[:1].to(device) for key, value in batch.observation.items()}
 
     def act() -> None:
-        agent.act(one, explore=True).cpu()
+        agent.act(one, explore=True, step=0).cpu()
 
     act()
     return _median_seconds(act)

@@ -12,13 +12,15 @@ from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.acting.run_env import own_bounds
 from merl.acting.workers import WorkerEnvs
+from merl.agents import load_initial_weights
 from merl.callbacks import Callback, CallbackList
 from merl.config import TrainConfig
-from merl.core import EnvironmentsLost, EvaluationFailed, MerlError, counted, is_image
+from merl.core import EnvironmentsLost, EvaluationFailed, MerlError, counted
 from merl.core.guards import LossGuard
 from merl.core.signals import Interrupt
 from merl.envs.user_env import MakeEnv
 from merl.loggers import CSV, make_loggers
+from merl.networks.settings import torch_settings
 from merl.replay import ReplayBuffer
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
@@ -87,6 +89,8 @@ class Trainer:
             if resumed is not None:
                 bounds = own_bounds(setup.env)
                 resumed[0].check_environment(setup.space, setup.action_space, bounds)
+            if resumed is None or resumed[1] is None:
+                load_initial_weights(setup.agent, setup.home)
             self._resources = stack.pop_all()
         self.config, self._resumed = setup.config, resumed
         self._averages, self._guard = Averages(), LossGuard()
@@ -153,7 +157,8 @@ class Trainer:
         self.run, self.clock, setup = run, Clock(), self.setup
         with ExitStack() as stack:
             self._interrupt = stack.enter_context(Interrupt().listening())
-            self.replay = setup.open_replay(run.replay)
+            with torch_settings(setup.device):
+                self.replay = ReplayBuffer(setup.replay_spec, run.replay)
             with self._interrupt.raising():
                 self._environments = self._make_environments()
             stack.callback(self._environments.close)
@@ -257,9 +262,8 @@ class Trainer:
     def _steps(self) -> Iterable[StepResult]:
         """Return the loop of Algorithm 1, which yields after every step of the environments."""
         setup = self.setup
-        images = tuple(key for key in setup.space if is_image(setup.space[key]))
         stacks = [
-            FrameStack(self.config.replay.frame_stack, images, setup.device)
+            FrameStack(setup.spec.modalities, setup.spec.frame_stack, setup.device)
             for _ in range(self._environments.count)
         ]
         update = make_update(
@@ -267,6 +271,7 @@ class Trainer:
             self.replay,
             setup.randomness,
             self.config,
+            setup.device,
             self._callbacks.on_warning,
             setup.progress.updates,
         )
@@ -320,7 +325,7 @@ class Trainer:
     def _is_to_stop(self) -> bool:
         """Return whether a signal, a callback or the time limit stops the run."""
         minutes = self.config.minutes
-        spent = minutes is not None and self.clock.stretch() > minutes * 60
+        spent = minutes is not None and self.clock.seconds_since_start() > minutes * 60
         return spent or self._stops or self._interrupt.number is not None
 
     def _at_episode_end(self) -> None:

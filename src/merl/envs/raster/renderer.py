@@ -6,14 +6,15 @@ import threading
 from dataclasses import asdict
 from importlib import import_module
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError, suggest
-from merl.envs.config import LARGEST_IMAGE, check_samples, check_whole
+from merl.core.fields import Range, check_value
+from merl.envs.config import LARGEST_IMAGE, Samples, check_samples
 from merl.envs.raster.scene import Scene, build_scene
 from merl.envs.warp_runtime import compiling, start_warp
 
@@ -45,7 +46,8 @@ class RasterRenderer:
     def __init__(
         self, physics: Any, camera: str, size: int, samples: int = 1, device: str = "cpu"
     ) -> None:
-        check_whole("size", size, 1, LARGEST_IMAGE)
+        check_value("size", size, Annotated[int, Range(1, LARGEST_IMAGE)])
+        check_value("samples", samples, Samples)
         check_samples(samples, size)
         self._wp, self._structs = start_warp(), import_module("merl.envs.raster.structs")
         self._model, self._data = physics.model.ptr, physics.data.ptr

@@ -1,0 +1,92 @@
+"""Updates recorded as CUDA graphs, one for each kind of update."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from merl.accelerate.recording import Recorded
+from merl.agents import make_agent
+from merl.agents.ddpg import DDPG
+from merl.agents.merl import MERLConfig
+from merl.core import Batch, UpdatePlan
+
+SPACE = spaces.Dict({"joints": spaces.Box(-1, 1, (5,), np.float32)})
+
+
+def make(**values: Any) -> DDPG:
+    config = MERLConfig(latent_dim=8, hidden_dim=8, precision="fp32", **values)
+    actions = spaces.Box(-1, 1, (2,), np.float32)
+    device = torch.device("cpu")
+    return make_agent(
+        "merl", config, SPACE, actions, frame_stack=1, seed=0, device=device, threads=1
+    )
+
+
+def random_batch() -> Batch:
+    rng = torch.Generator().manual_seed(0)
+    now, then = ({"joints": torch.rand((4, 5), generator=rng)} for _ in range(2))
+    action = torch.rand((4, 2), generator=rng)
+    return Batch(now, action, torch.rand(4, generator=rng), torch.full((4,), 0.9), then)
+
+
+def test_each_kind_of_update_has_its_own_warm_up_and_recording(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fake graph replaces CUDA graphs; replaying it computes nothing."""
+    agent, batch, events = make(actor_every=2), random_batch(), []
+    recorded = Recorded(agent, lambda: batch)
+
+    class FakeGraph:
+        def __init__(self, kind: bool) -> None:
+            self.kind = kind
+
+        def replay(self) -> None:
+            events.append(("replay", self.kind))
+
+    def record(plan: UpdatePlan) -> torch.cuda.CUDAGraph:
+        events.append(("record", plan.trains_actor))
+        recorded._values[plan.trains_actor] = recorded._learn_on_device(plan)
+        return cast(torch.cuda.CUDAGraph, FakeGraph(plan.trains_actor))
+
+    def learn_on_stream(plan: UpdatePlan) -> Tensor:
+        events.append(("warm up", plan.trains_actor))
+        return recorded._learn_on_device(plan)
+
+    monkeypatch.setattr(recorded, "_on_gpu", True)
+    monkeypatch.setattr(recorded, "_record", record)
+    monkeypatch.setattr(recorded, "_learn_on_stream", learn_on_stream)
+    metrics = [recorded(0) for _ in range(10)]
+    assert agent.updates == 10
+    kinds = [False, True] * 5
+    assert [kind for event, kind in events if event != "record"] == kinds
+    assert [event for event, _ in events] == ["warm up"] * 6 + ["record", "replay"] * 2 + [
+        "replay"
+    ] * 2
+    assert ["actor_loss" in each for each in metrics] == kinds
+
+
+def test_a_graph_reads_noise_and_step_size_from_tensors_that_follow_the_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A replayed graph runs no Python code, so both are set before it is launched."""
+    schedule = {"learning_rate": 1e-3, "learning_rate_end": 1e-4, "learning_rate_steps": 10}
+    noise = {"noise_std": 1.0, "noise_std_end": 0.5, "noise_steps": 10}
+    agent, twin, batch = make(**schedule, **noise), make(**schedule, **noise), random_batch()
+    recorded = Recorded(agent, lambda: batch)
+    monkeypatch.setattr(recorded, "_on_gpu", True)
+    monkeypatch.setattr(recorded, "_learn_on_stream", recorded._learn_on_device)
+    for step, rate, deviation in ((0, 1e-3, 1.0), (5, 5.5e-4, 0.75), (20, 1e-4, 0.5)):
+        recorded(step)
+        twin.update(batch, step=step)
+        for optimizer in (agent.critic_optimizer, agent.actor_optimizer):
+            assert optimizer.param_groups[0]["lr"] is recorded._step_size
+        assert float(recorded._step_size) == pytest.approx(rate)
+        assert float(recorded._noise_std) == pytest.approx(deviation)
+    for one, other in zip(agent.networks.parameters(), twin.networks.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-7)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 Setting = Literal["matched", "published"]
 """Source of an agent's values: MERL and the preset, or the agent's authors."""
+LoggerName = Literal["tensorboard", "wandb", "trackio"]
 Video = Literal["each", "last", "none"]
 Device = Literal["auto", "cpu", "cuda"]
 Steps = Annotated[int, Range(1, 10**12)]
@@ -88,9 +89,6 @@ class TrainConfig:
     """Seed of all randomness in the run."""
     steps: Steps = 1_000_000
     """Number of environment steps."""
-    measure: bool = False
-    """Time your own environment with 75 random steps before the run starts, as merl always does for
-    its own tasks; if not set, the first steps of the run are timed."""
     minutes: Annotated[float, Range(0, without=0)] | None = None
     """Time limit of the run in minutes, since start or resume."""
     run_dir: Path | None = None
@@ -122,6 +120,9 @@ class TrainConfig:
     save_every: Annotated[float, Range(0)] = 300.0
     """Seconds between checkpoints; a checkpoint waits for the end of an episode, unless that takes
     much longer."""
+    log: tuple[LoggerName, ...] = ()
+    """Where to write the metrics, in addition to metrics.csv: tensorboard, wandb, trackio (each is
+    an extra of this package)."""
     keep: Steps = 2
     """Number of recent checkpoints to keep, in addition to the best one."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(

@@ -37,7 +37,6 @@ def test_references_are_not_measured_in_a_user_environment_by_default(preset: st
     assert compose(preset, "move_box").eval.references
     assert not compose(preset, "my_robot:make").eval.references
     assert not TrainConfig("my_robot:make").eval.references
-    assert not TrainConfig("my_robot:make").measure
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -10,11 +11,11 @@ from merl.core import MerlError
 
 HARMLESS = (
     "steps",
-    "measure",
     "minutes",
     "worker_restarts",
     "worker_timeout",
     "save_every",
+    "log",
     "keep",
     "device",
     "threads",
@@ -70,6 +71,22 @@ def _with_known(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
     """Return a config with other values of the fields that it has; a user's agent lacks some."""
     known = flat(config)
     return override(config, {name: value for name, value in values.items() if name in known})
+
+
+def resume_request(
+    recorded: TrainConfig, steps: int | None, minutes: float | None, device: Any = None
+) -> TrainConfig:
+    """Return the config that asks to resume a run with other values; None keeps the recorded one.
+
+    Raises:
+        MerlError: a value is out of its range.
+    """
+    return dataclasses.replace(
+        reopened(recorded),
+        steps=recorded.steps if steps is None else steps,
+        minutes=minutes,
+        device=device or recorded.device,
+    )
 
 
 def merge_resume_config(

@@ -2,7 +2,7 @@
 
 config.json     config, spaces, versions, commit, machine
 metrics.csv     the metrics, one row per episode and evaluation (authoritative)
-tensorboard/    the same metrics as TensorBoard events
+tensorboard/    the same metrics as TensorBoard events, with `--log tensorboard`
 checkpoints/    the checkpoints from which the run resumes
 replay/         the memory-mapped replay buffer
 videos/         one episode of each filmed evaluation
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import uuid
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -269,6 +270,11 @@ class Run:
     def lock(self) -> AbstractContextManager[None]:
         """Lock the folder so that no other process trains in it; see `lock_folder`."""
         return lock_folder(self.path)
+
+    @property
+    def public_id(self) -> str:
+        """Return an id of the run that may be published; `trust` keeps the recorded one secret."""
+        return uuid.uuid5(uuid.UUID(record.read(self.path)["id"]), "merl").hex
 
     @property
     def checkpoints(self) -> Path:

@@ -101,8 +101,8 @@ def config_of(agent: str, task: str = f"{here}:Arm", **values: Any) -> TrainConf
         ("ddpg", {}, [], ["joints", "state"], []),
         ("sac", {}, [], ["joints", "state"], []),
         ("merl_state", {}, [], ["joints", "state"], []),
-        ("ddpg", {"vectors": ("state",)}, [], ["state"], []),
-        ("merl", {"images": ("mask",), "vectors": ("joints",)}, ["mask"], ["joints"], []),
+        ("ddpg", {"keys": ("state",)}, [], ["state"], []),
+        ("merl", {"keys": ("joints", "mask")}, ["mask"], ["joints"], []),
         ("merl", {"privileged": ("state",)}, ["mask", "pixels"], ["joints"], ["state"]),
     ],
 )
@@ -183,7 +183,7 @@ def test_a_run_prints_its_keys_and_resumes_with_them(
     encoder = policy._agent.networks.encoders.by_key["mask"]  # type: ignore[attr-defined]
     assert encoder.frames.bounds == (0, 1)
     agent = Run.open(run).config.agent
-    assert agent.keys == ("mask", "joints")
+    assert agent.keys == ("joints", "mask")
     assert main([*line, "--resume", "--steps", "50"]) == 0
 
 

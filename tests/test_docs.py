@@ -120,6 +120,11 @@ def test_commands_are_accepted(
     for file, code in re.findall(FILE, (ROOT / page).read_text(), re.DOTALL):
         (tmp_path / file).write_text(code)
     monkeypatch.chdir(tmp_path)
+    if "small_agent:SmallAgent" in arguments:
+        (tmp_path / "small_agent.py").write_text(python_in("agent.md"))
+        monkeypatch.setattr(sys, "path", list(sys.path))
+        monkeypatch.setitem(sys.modules, "small_agent", None)
+        del sys.modules["small_agent"]
     monkeypatch.setattr(Trainer, "__init__", accept)
     monkeypatch.setattr(Run, "open", accept)
     if arguments[0] not in ("train", "resume", "evaluate"):
@@ -133,10 +138,15 @@ def test_commands_are_accepted(
 
 def python_of(page: str) -> dict[str, Any]:
     """Run the first block of Python of a how-to page; return its names."""
-    (code, *_) = re.findall(r"```python\n(.*?)```", (DOCS / "howto" / page).read_text(), re.DOTALL)
     names: dict[str, Any] = {"__name__": "example"}
-    exec(compile(code, page, "exec"), names)
+    exec(compile(python_in(page), page, "exec"), names)
     return names
+
+
+def python_in(page: str) -> str:
+    """Return the first block of Python of a how-to page."""
+    (code, *_) = re.findall(r"```python\n(.*?)```", (DOCS / "howto" / page).read_text(), re.DOTALL)
+    return str(code)
 
 
 def test_the_task_of_the_how_to_page_works(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -183,7 +183,7 @@ def test_a_run_prints_its_keys_and_resumes_with_them(
     encoder = policy._agent.networks.encoders.by_key["mask"]  # type: ignore[attr-defined]
     assert encoder.frames.bounds == (0, 1)
     agent = Run.open(run).config.agent
-    assert agent.keys == ("mask", "joints")
+    assert agent.keys == ("joints", "mask")
     assert main([*line, "--resume", "--steps", "50"]) == 0
 
 

@@ -56,7 +56,7 @@ class Trainer:
         setup: environments, agent and random streams.
         config: the run's config, with the values that were chosen for this machine.
         run: the run's folder; set by `fit`.
-        replay: the replay buffer; set by `fit`.
+        replay: the replay buffer; set by `fit`, until the trainer is closed.
         clock: training time; set by `fit`.
         evaluations: the evaluations so far; set by `fit`.
 
@@ -102,8 +102,10 @@ class Trainer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the environments."""
+        """Close the environments and the replay, also if a callback keeps the trainer."""
         self._resources.close()
+        for name in ("replay", "_saver"):  # the files stay mapped as long as these exist
+            vars(self).pop(name, None)
 
     @property
     def progress(self) -> Progress:

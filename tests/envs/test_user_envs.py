@@ -116,7 +116,7 @@ def test_actions_are_rescaled_and_is_success_becomes_success() -> None:
         (vector(2), spaces.Box(-9, 9, (2,), np.int32), "a box of real numbers"),
         (spaces.Discrete(5), None, "neither an image"),
         (spaces.Dict({"a": spaces.Dict({"b": vector(2)})}), None, "neither an image"),
-        (spaces.Box(-1, 1, (4, 4), np.float32), None, "neither an image"),
+        (spaces.Box(-1, 1, (4, 4, 4), np.float32), None, "neither an image"),
     ],
 )
 def test_unusable_spaces_are_rejected(space: Any, actions: Any, message: str) -> None:

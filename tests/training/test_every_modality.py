@@ -158,11 +158,7 @@ def test_a_run_resumes_bit_for_bit_and_its_policy_acts(
         (["--agent.encoders.wrist", "conv"], "agent.encoders names 'wrist', but the observation"),
         (["--agent.encoders.rgb"], "--agent.encoders.rgb needs a value"),
         (["--agent.frozen-encoders", "wrist"], "agent.frozen-encoders names 'wrist'"),
-        pytest.param(
-            ["--agent.encoder-weights.rgb", "w.pt"],
-            "'rgb', whose encoder is not a model of timm",
-            marks=pytest.mark.xfail(reason="merged later", strict=True),
-        ),
+        (["--agent.encoder-weights.rgb", "w.pt"], "'rgb', whose encoder is not a model of timm"),
         (["--agent.fusion-layer", "attention", "--agent.latent-dim", "66"], "a multiple of 4"),
         (["--agent.conv-strides", "8", "8", "8"], "24x26 pixels is too small"),
     ],

@@ -101,8 +101,8 @@ def config_of(agent: str, task: str = f"{here}:Arm", **values: Any) -> TrainConf
         ("ddpg", {}, [], ["joints", "state"], []),
         ("sac", {}, [], ["joints", "state"], []),
         ("merl_state", {}, [], ["joints", "state"], []),
-        ("ddpg", {"vectors": ("state",)}, [], ["state"], []),
-        ("merl", {"images": ("mask",), "vectors": ("joints",)}, ["mask"], ["joints"], []),
+        ("ddpg", {"keys": ("state",)}, [], ["state"], []),
+        ("merl", {"keys": ("mask", "joints")}, ["mask"], ["joints"], []),
         ("merl", {"privileged": ("state",)}, ["mask", "pixels"], ["joints"], ["state"]),
     ],
 )

@@ -36,7 +36,7 @@ SMALL: dict[str, Any] = {
     "agent.hidden_dim": 16,
     "replay.batch_size": 4,
 }
-VECTOR: dict[str, Any] = SMALL | {"agent.images": ()}
+VECTOR: dict[str, Any] = SMALL | {"agent.modalities": ("vector",)}
 TASK = "merl.envs.dot:split"
 
 

@@ -117,7 +117,7 @@ def _local(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
             if hasattr(module, "TRACKIO_DIR"):
                 monkeypatch.setattr(module, "TRACKIO_DIR", tmp_path / "trackio")
     yield
-    if "wandb" in sys.modules:
+    if sys.modules.get("wandb") is not None:
         sys.modules["wandb"].teardown()  # it keeps the variables of its first use
 
 

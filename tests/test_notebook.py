@@ -24,7 +24,8 @@ import gymnasium, merl
 from toy import DotEnv
 small = dict(
     preset="smoke", random_steps=20, seed_steps=20, device="cpu", threads=1,
-    **{"eval.every": 0, "agent.hidden_dim": 16, "replay.batch_size": 4, "agent.images": ()},
+    **{"eval.every": 0, "agent.hidden_dim": 16, "replay.batch_size": 4},
+    **{"agent.modalities": ("vector",)},
 )
 """,
     """

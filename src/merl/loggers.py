@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from merl.callbacks import Callback
 from merl.config import LoggerName
 from merl.core import MerlError
-from merl.core.user_code import in_one_line
+from merl.core.user_code import reason
 from merl.evaluation.evaluation import Evaluation
 from merl.runs.metrics import MetricsFile, append_whole
 from merl.runs.plain import to_plain
@@ -52,9 +52,7 @@ class Logger(Callback):
             self.open(trainer)
         except Exception as error:
             if trainer.progress.step == 0:
-                raise MerlError(
-                    f"{type(self).__name__} cannot log: {in_one_line(error)}"
-                ) from error
+                raise MerlError(f"{type(self).__name__} cannot log: {reason(error)}") from error
             self._warn(error)
 
     def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
@@ -80,7 +78,7 @@ class Logger(Callback):
         if not self._warned:
             self._warned = True
             self._trainer.warn(
-                f"{type(self).__name__} does not log everything: {in_one_line(error)}; training "
+                f"{type(self).__name__} does not log everything: {reason(error)}; training "
                 "continues, and metrics.csv has all metrics"
             )
 

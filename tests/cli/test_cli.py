@@ -60,6 +60,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train a whole `smoke` run once; return its folder."""
     folder = tmp_path_factory.mktemp("runs") / folder_name()
     arguments = ["train", "reach_duplo", "--preset", "smoke", "--run-dir", str(folder)]
+    arguments += ["--log", "tensorboard"]
     out, err = io.StringIO(), io.StringIO()
     with small_videos(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         assert main([*arguments, "--threads", "1", *SMALL_VIDEO]) == 0
@@ -175,7 +176,7 @@ def test_evaluating_with_gl_uses_one_sample(run: Path, monkeypatch: pytest.Monke
     env_config = dataclasses.replace(policy.config.env, samples=2)
     policy.config = dataclasses.replace(policy.config, env=env_config)
     monkeypatch.setattr(
-        "merl.evaluation.policy.make_run_env", lambda config, **changes: made.append(changes)
+        "merl.evaluation.policy.make_run_env", lambda config, _, **changes: made.append(changes)
     )
     policy.make_env(renderer="gl")
     policy.make_env(renderer="raster")

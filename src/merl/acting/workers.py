@@ -297,7 +297,7 @@ class _Maker:
     here: gymnasium.Env[Any, Any] | None
     folder: Path | None
     """The folder from which the module of a user's environment was loaded."""
-    make: MakeEnv | None
+    make: MakeEnv | None = None
     safe_path: str | None = field(default_factory=users_value)
     """The user's value of `PYTHONSAFEPATH`, for Python processes that the environment starts."""
 

@@ -26,8 +26,8 @@ class RunOptions:
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     trust: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Import the environment that the run names, although you have not trained this run here. This
-    runs the code of the run's author."""
+    """Import the environment, agent and encoders that the run names, although you have not trained
+    this run here. This runs the code of the run's author."""
 
     def __post_init__(self) -> None:
         check_fields(self, "--")

@@ -19,7 +19,7 @@ class ResumeOptions(RunOptions):
 
     steps: Annotated[int, Range(1)] | None = None
     """Train to this total number of steps; by default to the run's own --steps."""
-    minutes: float | None = None
+    minutes: Annotated[float, Range(0, without=0)] | None = None
     """Stop after this many minutes from now; by default there is no time limit."""
     device: Device | None = None
     """Where the networks live from now on; by default where they were before."""

@@ -11,7 +11,7 @@ from rich.table import Table
 from merl.acting.run_env import make_run_env
 from merl.config import TrainConfig
 from merl.core import counted
-from merl.core.user_code import in_one_line
+from merl.core.user_code import reason
 from merl.evaluation.evaluation import Act, Evaluation, evaluate
 from merl.report.references import RANDOM, Reference, references
 from merl.runs.run_folder import resume_line
@@ -43,7 +43,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
         curve = learning_curve(run.path, run.path / "curve.png", references=lines)
         console.print(f"learning curve: {curve}", highlight=False, soft_wrap=True)
     except Exception as error:  # Matplotlib's errors too
-        console.print(f"the curve was not drawn: {in_one_line(error)}", highlight=False)
+        console.print(f"the curve was not drawn: {reason(error)}", highlight=False)
     videos = sorted(run.videos.glob("*.mp4")) if run.videos.is_dir() else []
     if videos:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
@@ -112,7 +112,7 @@ def _measured(
     try:
         return floors(config, reports_success=reports_success)
     except Exception as error:
-        console.print(f"there is nothing to compare with: {in_one_line(error)}", highlight=False)
+        console.print(f"there is nothing to compare with: {reason(error)}", highlight=False)
         return ()
 
 

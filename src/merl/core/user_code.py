@@ -112,13 +112,13 @@ def _file_of(name: str) -> Path | None:
     return None if file is None else Path(file).resolve()
 
 
-def in_one_line(error: BaseException) -> str:
-    """Return an exception's type and text, and the last line in the user's files that led to it.
+def reason(error: Exception) -> str:
+    """Return the message of a `MerlError`, which is made for the user, or else `in_one_line()`."""
+    return str(error) if isinstance(error, MerlError) else in_one_line(error)
 
-    Of a `MerlError`, whose message is made for the user, return only the message.
-    """
-    if isinstance(error, MerlError):
-        return str(error)
+
+def in_one_line(error: BaseException) -> str:
+    """Return an exception's type and text, and the last line in the user's files that led to it."""
     try:
         text = " ".join(str(error).split())
     except Exception:  # the exception's own __str__ may fail

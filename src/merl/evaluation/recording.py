@@ -13,7 +13,7 @@ import numpy as np
 
 from merl.acting.rollout import Episode
 from merl.core import MerlError
-from merl.core.user_code import in_one_line
+from merl.core.user_code import reason
 from merl.envs.frame_rate import frame_rate
 from merl.evaluation.video import FPS, Value, VideoWriter
 
@@ -78,7 +78,7 @@ class EpisodeVideo:
         except Exception as error:  # from the user's `render`, the encoder or the disk
             self.abort()
             self._writer = None
-            why = in_one_line(error)
+            why = reason(error)
             if self._warn is None:
                 raise MerlError(f"the video {self._path} cannot be made: {why}") from error
             self._warn(f"there is no video of this evaluation: {why}")

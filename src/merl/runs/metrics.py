@@ -7,13 +7,13 @@ never ends a run: the rows are kept in memory and written as soon as that is pos
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import errno
 import io
 import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 from merl.core import METRICS_FILE, MerlError
@@ -21,7 +21,7 @@ from merl.core import METRICS_FILE, MerlError
 _LOG = logging.getLogger(__name__)
 
 
-class MetricsFile(contextlib.AbstractContextManager["MetricsFile"]):
+class MetricsFile(AbstractContextManager["MetricsFile"]):
     """The file `metrics.csv` of a run, open for writing; a context manager.
 
     All rows are also held in memory (a few MB for the longest run). A new step is one `write` of
@@ -120,7 +120,7 @@ class MetricsFile(contextlib.AbstractContextManager["MetricsFile"]):
             self._guard(self._sync)
             self._guard(self._file.close)
 
-    def _guard(self, action: Callable[[], None]) -> None:
+    def _guard(self, action: Callable[[], object]) -> None:
         """Run a file operation; if it fails, warn the user once and continue."""
         try:
             action()
@@ -154,7 +154,7 @@ class MetricsFile(contextlib.AbstractContextManager["MetricsFile"]):
                 os.fsync(file.fileno())
             temporary.replace(self._path)
         except OSError:
-            with contextlib.suppress(OSError):  # the disk may also refuse to delete
+            with suppress(OSError):  # the disk may also refuse to delete
                 temporary.unlink(missing_ok=True)
             raise
         if self._file is not None:

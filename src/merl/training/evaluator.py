@@ -7,7 +7,7 @@ from collections.abc import Callable
 from merl.callbacks import Callback
 from merl.core import EvaluationFailed, MerlError
 from merl.core.signals import Interrupt
-from merl.core.user_code import in_one_line
+from merl.core.user_code import reason
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.policy import Policy
 from merl.runs.run import Run
@@ -126,7 +126,7 @@ class Evaluations:
         resumed run does not end with the same failure again.
         """
         self._run.check_there()
-        why = in_one_line(error)
+        why = reason(error)
         if self._setup.progress.attempts > 1:
             self._skip(f"failed again: {why}")
             return

@@ -16,8 +16,9 @@ from gymnasium import spaces
 
 from merl.accelerate.networks import speed_up
 from merl.acting.env_checks import check_instances
+from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
-from merl.acting.workers import check_sendable
+from merl.acting.workers import WorkerEnvs, check_sendable
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
 from merl.agents.networks import make_networks, own_encoders
@@ -100,6 +101,12 @@ class Setup:
             threads=best.threads,
         )
         speed_up(self.agent)
+
+    def make_environments(self) -> Environments:
+        """Return the environments that the run trains in: `env`, or worker processes."""
+        if self.config.has_workers:
+            return WorkerEnvs(self.config, self.env, self.make)
+        return InProcessEnvs(self.env)
 
     @classmethod
     @contextmanager

@@ -8,10 +8,8 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from threading import Lock
 
-from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.acting.run_env import own_bounds
-from merl.acting.workers import WorkerEnvs
 from merl.agents import load_initial_weights
 from merl.callbacks import Callback, CallbackList
 from merl.config import CUSTOM, Source, TrainConfig
@@ -58,7 +56,7 @@ class Trainer:
         setup: environments, agent and random streams.
         config: the run's config, with the values that were chosen for this machine.
         run: the run's folder; set by `fit`.
-        replay: the replay buffer; set by `fit`.
+        replay: the replay buffer; set by `fit`, until the trainer is closed.
         clock: training time; set by `fit`.
         evaluations: the evaluations so far; set by `fit`.
 
@@ -86,10 +84,8 @@ class Trainer:
         self._csv = CSV()
         self._callbacks = CallbackList([self._csv, *make_loggers(config.log), *callbacks])
         with ExitStack() as stack:
-            self.setup = stack.enter_context(
-                Setup.prepare(config, new=resumed is None, source=source, make=make)
-            )
-            setup = self.setup
+            prepared = Setup.prepare(config, new=resumed is None, source=source, make=make)
+            self.setup = setup = stack.enter_context(prepared)
             if resumed is not None:
                 bounds = own_bounds(setup.env)
                 resumed[0].check_environment(setup.space, setup.action_space, bounds)
@@ -106,8 +102,10 @@ class Trainer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the environments."""
+        """Close the environments and the replay, also if a callback keeps the trainer."""
         self._resources.close()
+        for name in ("replay", "_saver"):  # the files stay mapped as long as these exist
+            vars(self).pop(name, None)
 
     @property
     def progress(self) -> Progress:
@@ -144,13 +142,10 @@ class Trainer:
             if self._resumed is not None:
                 run, start = self._resumed
                 return self._fit(dataclasses.replace(run, config=self.config), start)
-            setup = self.setup
+            setup, source = self.setup, self._source
             spaces = setup.space, setup.action_space, own_bounds(setup.env)
-            run = stack.enter_context(
-                Run.begin(
-                    self.config, *spaces, setup.left_open, source=self._source, home=setup.home
-                )
-            )
+            begun = Run.begin(self.config, *spaces, setup.left_open, source=source, home=setup.home)
+            run = stack.enter_context(begun)
             try:
                 return self._fit(run, None)
             except BaseException:
@@ -166,7 +161,7 @@ class Trainer:
             with torch_settings(setup.device):
                 self.replay = ReplayBuffer(setup.replay_spec, run.replay)
             with self._interrupt.raising():
-                self._environments = self._make_environments()
+                self._environments = setup.make_environments()
             stack.callback(self._environments.close)
             self.evaluations = Evaluations(setup, run, self.clock, self._callbacks, self._interrupt)
             self._saver = Saver(
@@ -191,12 +186,6 @@ class Trainer:
                 self._callbacks.on_end(outcome)
         unwritten = self._csv.file.unwritten if self._csv.file else 0
         return dataclasses.replace(outcome, unwritten=unwritten)
-
-    def _make_environments(self) -> Environments:
-        env = self.setup.env
-        if self.config.has_workers:
-            return WorkerEnvs(self.config, env, self.setup.make)
-        return InProcessEnvs(env)
 
     def _train_and_rescue(self) -> Outcome:
         """Train; after an error, save the run and raise the error.

@@ -15,7 +15,7 @@ import pytest
 from merl.bench.update import load_example
 
 FILE = Path(__file__).parents[2] / "examples/merl_minimal.py"
-STANDING_STILL, OPTIMUM = 10.0, 18.7  # mean returns (docs/small_tasks.md)
+STANDING_STILL, OPTIMUM = 10.0, 18.7  # mean returns (docs/explanation/small_tasks.md)
 
 
 def test_example_has_at_most_180_lines_and_uses_only_an_environment_of_merl() -> None:

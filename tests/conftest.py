@@ -22,6 +22,7 @@ ALLOWED_SKIPS = (
     r"this machine has CUDA",
     r"timm is not installed",
     r"this system does not allow users to mount a disk",
+    r"could not import '(tensorboard|wandb|trackio|nbclient|ipykernel)",
 )
 """Regular expressions of the allowed reasons to skip a test; any other skip is a failure."""
 

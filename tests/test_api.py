@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections import Counter
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from torch import Tensor
 
 import merl
-from merl.core import MerlError
+from merl.cli import main
+from merl.core import CallbackFailed, MerlError
 from merl.evaluation.evaluation import Evaluation
+from merl.report.curves import read_metrics
 from merl.training.loop import StepResult
-from merl.training.trainer import Outcome
+from merl.training.outcome import Outcome
+from toy import DotEnv
 
 SMALL: dict[str, Any] = {
     "preset": "smoke",
@@ -29,6 +36,7 @@ SMALL: dict[str, Any] = {
     "agent.hidden_dim": 16,
     "replay.batch_size": 4,
 }
+VECTOR: dict[str, Any] = SMALL | {"agent.images": ()}
 TASK = "merl.envs.dot:split"
 
 
@@ -42,7 +50,7 @@ class Recorder(merl.Callback):
         self.episode: Mapping[str, float] = {}
 
     def on_start(self, trainer: merl.Trainer) -> None:
-        assert trainer.setup.progress.step == 0
+        assert trainer.progress.step == 0
         self.calls["start"] += 1
 
     def on_step(self, result: StepResult) -> bool | None:
@@ -112,10 +120,174 @@ def test_a_callback_that_raises_ends_the_run_which_is_saved(tmp_path: Path) -> N
             return None
 
     fails = Fails()
-    with pytest.raises(RuntimeError, match="the logger is gone"):
+    with pytest.raises(CallbackFailed) as caught:
         merl.train(TASK, callbacks=[fails], run_dir=tmp_path / "run", **SMALL)
+    message = str(caught.value)
+    assert message.startswith(
+        "callback Fails.on_step raised RuntimeError: the logger is gone (test_api.py, line"
+    )
+    assert "the run is saved at step 30: fix the cause, and resume with `merl resume " in message
+    assert "\n" not in message
+    assert isinstance(caught.value.__cause__, RuntimeError)
     assert merl.load_policy(tmp_path / "run").step == 30
     assert (fails.calls["end"], fails.outcome) == (1, None)
+    assert merl.resume(tmp_path / "run").progress.step == 60
+    # The episode was cut off at step 30.
+    assert read_metrics(tmp_path / "run")["step"].tolist() == [20, 50, 60]
+
+
+@pytest.mark.parametrize("event", ["on_start", "on_episode", "on_evaluation", "on_checkpoint"])
+def test_a_failure_in_any_event_loses_nothing(event: str, tmp_path: Path) -> None:
+    def fail(*_: Any) -> None:
+        if event == "on_start" or (tmp_path / "run/checkpoints/00000040").exists():
+            raise RuntimeError("broken")
+
+    fails = merl.Callback()
+    setattr(fails, event, fail)
+    with pytest.raises(CallbackFailed, match=f"callback Callback.{event} raised RuntimeError"):
+        merl.train(TASK, callbacks=[fails], run_dir=tmp_path / "run", **SMALL)
+    if event == "on_start":
+        assert not (tmp_path / "run").exists()
+        return
+    merl.resume(tmp_path / "run")
+    metrics = read_metrics(tmp_path / "run")
+    assert metrics["step"].tolist() == [20, 40, 60]
+    assert np.isfinite(metrics["eval/return"]).tolist() == [False, True, True]
+
+
+def test_a_failure_at_the_end_is_a_warning(tmp_path: Path) -> None:
+    class Fails(Recorder):
+        def on_end(self, outcome: Outcome | None) -> None:
+            raise RuntimeError("broken")
+
+        def on_warning(self, message: str) -> None:
+            self.calls[message] += 1
+
+    fails, recorder = Fails(), Recorder()
+    outcome = merl.train(TASK, callbacks=[fails, recorder], run_dir=tmp_path / "run", **SMALL)
+    assert (outcome.saved, recorder.calls["end"]) == (True, 1)
+    (message,) = (text for text in fails.calls if "Fails.on_end raised RuntimeError" in text)
+    assert fails.calls[message] == 1
+
+
+def test_stop_ends_training_from_any_event(tmp_path: Path) -> None:
+    class Stops(Recorder):
+        def on_start(self, trainer: merl.Trainer) -> None:
+            self.trainer = trainer
+
+        def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
+            self.trainer.stop()
+
+    outcome = merl.train(TASK, callbacks=[Stops()], run_dir=tmp_path / "run", **SMALL)
+    assert (outcome.progress.step, outcome.saved) == (20, True)
+
+
+def test_a_second_run_in_one_process_is_refused(tmp_path: Path) -> None:
+    refused = []
+
+    class Nests(Recorder):
+        def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
+            with pytest.raises(MerlError) as caught:
+                merl.train(TASK, run_dir=tmp_path / "inner", **SMALL)
+            refused.append(str(caught.value))
+
+    outcome = merl.train(TASK, callbacks=[Nests()], run_dir=tmp_path / "run", **SMALL)
+    assert outcome.progress.step == 60
+    assert set(refused) == {
+        "this process is training another run: wait for its end, or train in another process"
+    }
+    assert not (tmp_path / "inner").exists()
+    again = merl.train(TASK, run_dir=tmp_path / "next", **SMALL)  # the first one has ended
+    assert again.progress.step == 60
+
+
+def test_training_works_in_another_thread_without_signals(tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with ThreadPoolExecutor(1) as pool:
+        outcome = pool.submit(lambda: merl.train(TASK, run_dir=tmp_path / "run", **SMALL)).result()
+    assert outcome.progress.step == 60
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def closure() -> Any:
+    """Return a function that makes an environment and cannot be imported by its name."""
+    length = 10
+
+    def make() -> DotEnv:
+        env = DotEnv()
+        env.length = length
+        return env
+
+    return make
+
+
+def importable() -> DotEnv:
+    return DotEnv()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_function_makes_the_environment(workers: int, tmp_path: Path) -> None:
+    make, run = closure(), tmp_path / "run"
+    small = VECTOR | {"num_envs": workers}
+    outcome = merl.train(env=make, run_dir=run, **small | {"steps": 40})
+    assert outcome.run.config.task == "make()"
+    with pytest.raises(MerlError, match=r"'make\(\)' is a Python function, which the run does not"):
+        merl.resume(run, steps=60)
+    assert main(["resume", str(run), "--steps", "60"]) == 2
+    outcome = merl.resume(run, env=make, steps=60)
+    assert outcome.progress.step == 60
+    policy = merl.load_policy(run)  # needs no environment
+    assert policy(make().reset(seed=0)[0]).shape == (1,)
+    with pytest.raises(MerlError, match="pass it again"):
+        merl.evaluate(run)
+    assert outcome.evaluation is not None
+    again = merl.evaluate(run, env=make, episodes=2).returns
+    assert again == merl.evaluate(run, env=make, episodes=2).returns
+
+
+def test_the_run_records_a_function_that_can_be_imported(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    outcome = merl.train(importable, run_dir=run, **VECTOR)
+    assert outcome.run.config.task == "test_api:importable"
+    assert merl.resume(run, steps=80).progress.step == 80
+    assert len(merl.evaluate(run, episodes=2).episodes) == 2
+
+
+def test_an_environment_that_cannot_be_used_is_named(tmp_path: Path) -> None:
+    where = {"run_dir": tmp_path / "run"} | SMALL
+    lock = threading.Lock()
+    with pytest.raises(MerlError, match=r"env is a DotEnv: give a function that makes it"):
+        merl.train(DotEnv(), **where)  # type: ignore[arg-type]
+    with pytest.raises(MerlError, match=r"train needs one of task and env"):
+        merl.train(**where)
+    with pytest.raises(MerlError, match=r"train needs one of task and env"):
+        merl.train(TASK, env=importable, **where)
+    with pytest.raises(MerlError, match=r"lambda\(\) cannot be sent to the worker processes .* 2 "):
+        merl.train(lambda: (DotEnv(), lock)[0], num_envs=2, **where)
+    with pytest.raises(MerlError, match=r"task 'lambda\(\)' returned int, not a gymnasium.Env"):
+        merl.train(lambda: 1, **where)  # type: ignore[arg-type, return-value]
+    assert not (tmp_path / "run").exists()
+
+
+def test_resume_continues_a_run_and_returns_one_that_has_ended(tmp_path: Path) -> None:
+    run, recorder = tmp_path / "run", Recorder()
+    merl.train(TASK, run_dir=run, **SMALL)
+    done = merl.resume(str(run), callbacks=[recorder])
+    assert (done.progress.step, done.saved, recorder.calls["step"]) == (60, True, 0)
+    recorder.on_start = lambda trainer: None  # type: ignore[method-assign]
+    outcome = merl.resume(run, steps=100, callbacks=[recorder])
+    assert (outcome.progress.step, recorder.calls["step"]) == (100, 40)
+    with pytest.raises(MerlError, match=r"--steps 10 is less than the 100 already taken"):
+        merl.resume(run, steps=10)
+    with pytest.raises(MerlError, match="steps must be at least 1"):
+        merl.resume(run, steps=0)
+    with pytest.raises(MerlError, match="is not a run"):
+        merl.resume(tmp_path / "nowhere")
+
+
+def test_the_public_names_exist() -> None:
+    for name in merl.__all__:
+        assert getattr(merl, name) is not None
 
 
 def test_a_whole_config_can_be_trained(tmp_path: Path) -> None:

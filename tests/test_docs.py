@@ -152,9 +152,3 @@ def test_the_robot_of_the_how_to_page_is_an_environment() -> None:
     observation, _, _, _, info = env.step(env.action_space.sample())
     assert env.observation_space.contains(observation)
     assert info["success"] in (True, False)
-
-
-def test_the_logger_of_the_how_to_page_logs(tmp_path: Path) -> None:
-    callback = python_of("logging.md")["JsonLines"](tmp_path / "metrics.jsonl")
-    callback.on_episode(250, {"train/return": 1.0})
-    assert (tmp_path / "metrics.jsonl").read_text() == '{"step": 250, "train/return": 1.0}\n'

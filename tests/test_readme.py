@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from merl.cli import COMMANDS, main
-from merl.config import TrainConfig
+from merl.config import Source, TrainConfig
 from merl.runs.run_folder import run_path
 
 ROOT = Path(__file__).parents[1]
@@ -33,8 +33,8 @@ def test_each_command_names_a_run_of_an_earlier_command(
     monkeypatch.chdir(tmp_path)
     runs: set[Path] = set()
 
-    def begin(config: TrainConfig, what: str) -> int:
-        runs.add(run_path(config).absolute())
+    def begin(config: TrainConfig, source: Source, what: str) -> int:
+        runs.add(run_path(config, source).absolute())
         return 0
 
     monkeypatch.setattr("merl.cli.train.begin", begin)

@@ -30,7 +30,9 @@ __all__ = [
     "__version__",
     "evaluate",
     "load_policy",
+    "loggers",
     "make_env",
+    "resume",
     "train",
 ]
 
@@ -39,27 +41,31 @@ from merl.envs.registration import register as _register
 _register()
 
 if TYPE_CHECKING:
-    from merl.api import evaluate, train
+    from merl import loggers
+    from merl.api import evaluate, resume, train
+    from merl.callbacks import Callback
     from merl.config import TrainConfig
     from merl.envs import make_env
     from merl.evaluation.policy import load_policy
-    from merl.training.callbacks import Callback
     from merl.training.trainer import Trainer
 
 _PUBLIC = {
-    "Callback": "merl.training.callbacks",
+    "Callback": "merl.callbacks",
     "TrainConfig": "merl.config",
     "Trainer": "merl.training.trainer",
     "evaluate": "merl.api",
     "load_policy": "merl.evaluation.policy",
+    "loggers": "merl.loggers",
     "make_env": "merl.envs",
+    "resume": "merl.api",
     "train": "merl.api",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
-        return getattr(import_module(_PUBLIC[name]), name)
+        module = import_module(_PUBLIC[name])
+        return getattr(module, name, module)
     raise AttributeError(f"module 'merl' has no attribute {name!r}")
 
 

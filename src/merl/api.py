@@ -1,4 +1,4 @@
-"""Train and evaluate from Python.
+"""Train, resume and evaluate from Python; docs/howto/python.md has examples.
 
 Example:
     outcome = merl.train("reach_duplo", steps=100_000, **{"agent.noise_std": 0.3})
@@ -11,28 +11,45 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from merl.config import Setting, TrainConfig, override
+from merl.callbacks import Callback
+from merl.config import CUSTOM, Device, Setting, Source, TrainConfig, override
+from merl.core import MerlError
 from merl.envs.config import RendererName
+from merl.envs.user_env import MakeEnv, task_of
 from merl.evaluation.evaluation import Evaluation
 from merl.evaluation.policy import load_policy
 from merl.experiments.presets import compose, default_preset
-from merl.training.callbacks import Callback
-from merl.training.trainer import Outcome, Trainer
+from merl.runs.resume import resume_request
+from merl.runs.run import Run
+from merl.training.live_view import LiveView
+from merl.training.outcome import Outcome
+from merl.training.resuming import resumption
+from merl.training.trainer import Trainer
 
 
 def train(
-    task: str | TrainConfig,
+    task: str | TrainConfig | MakeEnv | None = None,
     *,
+    env: MakeEnv | None = None,
     preset: str | None = None,
     agent: str | type | None = None,
     setting: Setting = "matched",
     callbacks: Iterable[Callback] = (),
+    progress: bool = True,
     **overrides: Any,
 ) -> Outcome:
     """Train a new run.
 
+    Ctrl-C, or the interrupt of a notebook's kernel, stops training: the run is saved, and the
+    outcome is returned. One run at a time can be trained in a process.
+
     Args:
-        task: one of merl's tasks, a Gymnasium id, or `module:function`; or a whole config.
+        task: one of merl's tasks, a Gymnasium id, or `module:function`; or a whole config; or a
+            function that makes an environment.
+        env: a function that makes an environment, without arguments or with `render_mode`, e.g.
+            `lambda: gymnasium.make("Pendulum-v1")`. It is called once for training and once for
+            evaluation. The run does not record a lambda, or a function of a notebook: give it to
+            `resume` and `evaluate` again.
         preset: the values that others override (`merl.experiments.presets.PRESETS`); if not given,
             `paper` on a machine with CUDA, else `laptop`. Ignored if `task` is a config.
         agent: the agent's name, or your own class of agent (docs/howto/agent.md); if not given, the
@@ -40,6 +57,8 @@ def train(
         setting: `matched` (MERL's values) or `published` (those of the agent's authors). Ignored if
             `task` is a config.
         callbacks: called while it trains.
+        progress: whether to show a progress bar, in a terminal or a notebook; in other output,
+            lines.
         overrides: values of `TrainConfig` by name, nested ones by their dotted name, as on the
             command line: `steps=1000, **{"agent.noise_std": 0.3}`. `run_dir` may be a string.
 
@@ -49,21 +68,69 @@ def train(
     Raises:
         MerlError: a value cannot work; or see `Trainer.fit`.
     """
+    if not isinstance(task, str | TrainConfig):
+        task, env = None, env or task
+    if (task is None) == (env is None) and not isinstance(task, TrainConfig):
+        raise MerlError("train needs one of task and env: the name of a task, or a function")
+    make = None
+    if env is not None:
+        name, make = task_of(env)
+        overrides["task"] = name
     if isinstance(agent, type):
         agent = f"{agent.__module__}:{agent.__qualname__}"
-    if isinstance(task, str):
-        config = compose(preset or default_preset(), task, agent, setting)
-    else:
-        config = task
+    source = CUSTOM
+    if not isinstance(task, TrainConfig):
+        source = Source(preset or default_preset(), setting)
+        task = compose(source.preset, task or name, agent, setting)
     if overrides.get("run_dir") is not None:
         overrides["run_dir"] = Path(overrides["run_dir"])
-    with Trainer(override(config, overrides), callbacks) as trainer:
-        return trainer.fit()
+    return _fit(override(task, overrides), callbacks, progress, make=make, source=source)
+
+
+def resume(
+    run: Path | str,
+    *,
+    env: MakeEnv | None = None,
+    steps: int | None = None,
+    minutes: float | None = None,
+    device: Device | None = None,
+    callbacks: Iterable[Callback] = (),
+    progress: bool = True,
+    trust: bool = False,
+) -> Outcome:
+    """Resume a run from its last checkpoint.
+
+    Args:
+        run: the run's folder.
+        env: a function that makes the run's environment; needed if `train` was given one that the
+            run does not record.
+        steps: train to this total number of steps; if not given, to the run's own.
+        minutes: stop after this many minutes from now; if not given, there is no time limit.
+        device: where the networks live from now on; if not given, where they were before.
+        callbacks: called while it trains. The loggers of the run's config log again by themselves.
+        progress: see `train`.
+        trust: see `evaluate`.
+
+    Returns:
+        As `train`. The outcome of a run that has ended already has no evaluation.
+
+    Raises:
+        MerlError: the run cannot be resumed; or see `Trainer.fit`.
+    """
+    opened = Run.open(Path(run)).with_agent(trusted=trust)
+    asked = resume_request(opened.config, steps, minutes, device)
+    imports = env is None
+    with resumption(opened, asked, ["device"], imports=imports, trusted=trust) as found:
+        if found.done is not None:
+            return found.done
+        resumed = found.run, found.start
+        return _fit(found.config, callbacks, progress, make=env, resumed=resumed)
 
 
 def evaluate(
     run: Path | str,
     *,
+    env: MakeEnv | None = None,
     episodes: int = 10,
     checkpoint: str = "latest",
     video: Path | str | None = None,
@@ -75,6 +142,7 @@ def evaluate(
 
     Args:
         run: the run's folder.
+        env: see `resume`.
         episodes: number of episodes, at least 1.
         checkpoint: `latest`, `best` (by evaluation return), or a number of steps.
         video: record the first episode into this MP4 file.
@@ -88,9 +156,18 @@ def evaluate(
     """
     policy = load_policy(run, checkpoint=checkpoint, trust=trust)
     return policy.evaluate(
+        env=env,
         episodes=episodes,
         video=None if video is None else Path(video).absolute(),
         renderer=renderer,
         max_episode_steps=max_episode_steps,
         trust=trust,
     )
+
+
+def _fit(
+    config: TrainConfig, callbacks: Iterable[Callback], progress: bool, **options: Any
+) -> Outcome:
+    views = [LiveView()] if progress else []
+    with Trainer(config, [*callbacks, *views], **options) as trainer:
+        return trainer.fit()

@@ -13,8 +13,9 @@ import tyro
 from merl.agents import AGENTS
 from merl.agents.config import ObservationConfig
 from merl.core import MerlError, check_choice, counted, suggest
+from merl.core.choices import HandStart
 from merl.core.fields import NOT_EMPTY, Range, check_fields
-from merl.envs.config import EnvConfig, StartName, UserEnvConfig
+from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.replay import ReplayConfig
 
@@ -23,11 +24,24 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound="DataclassInstance")
 Setting = Literal["matched", "published"]
-
+"""Source of an agent's values: MERL and the preset, or the agent's authors."""
+LoggerName = Literal["tensorboard", "wandb", "trackio"]
 Video = Literal["each", "last", "none"]
 Device = Literal["auto", "cpu", "cuda"]
 Steps = Annotated[int, Range(1, 10**12)]
 NotNegative = Annotated[int, Range(0)]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the values of a config come from; a run records it beside the config."""
+
+    preset: str = "custom"
+    setting: Setting = "matched"
+
+
+CUSTOM = Source()
+"""The source of a config that is not made from a preset."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +53,7 @@ class EvaluationConfig:
     instance of the environment is made, as a single physical robot requires."""
     episodes: Steps = 10
     """Number of episodes of each evaluation."""
-    start: Annotated[tuple[StartName, ...], NOT_EMPTY] | None = None
+    start: Annotated[tuple[HandStart, ...], NOT_EMPTY] | None = None
     """Start of the hand in evaluations (see `--start`); if not set, the same as in training."""
     max_episode_steps: Steps = 2000
     """Limit in steps for evaluation episodes that do not end earlier."""
@@ -69,20 +83,12 @@ class TrainConfig:
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """Task: reach_duplo or another one of `merl tasks`, a Gymnasium id, or module:function,
     where the function makes an environment."""
-    preset: tyro.conf.Suppress[str] = "paper"
-    """Set of default values for the other options: paper, laptop, state or smoke."""
     agent_name: tyro.conf.Suppress[str] = "merl"
     """Name of the agent, which `agent` configures: a key of `AGENTS`, or `module:Class`."""
-    setting: tyro.conf.Suppress[Setting] = "matched"
-    """Source of the agent's hyperparameters: MERL and the preset (matched), or the agent's authors
-    (published)."""
     seed: NotNegative = 0
     """Seed of all randomness in the run."""
     steps: Steps = 1_000_000
     """Number of environment steps."""
-    measure: bool = False
-    """Time your own environment with 75 random steps before the run starts, as merl always does for
-    its own tasks; if not set, the first steps of the run are timed."""
     minutes: Annotated[float, Range(0, without=0)] | None = None
     """Time limit of the run in minutes, since start or resume."""
     run_dir: Path | None = None
@@ -114,6 +120,9 @@ class TrainConfig:
     save_every: Annotated[float, Range(0)] = 300.0
     """Seconds between checkpoints; a checkpoint waits for the end of an episode, unless that takes
     much longer."""
+    log: tuple[LoggerName, ...] = ()
+    """Where to write the metrics, in addition to metrics.csv: tensorboard, wandb, trackio (each is
+    an extra of this package)."""
     keep: Steps = 2
     """Number of recent checkpoints to keep, in addition to the best one."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(

@@ -98,7 +98,7 @@ def test_observation_of_a_user_environment_has_the_keys_of_the_agent() -> None:
             "which the actor uses too",
         ),
         ({"modalities": ("vector",), "privileged": ("proprio",)}, "leaves no key for the actor"),
-        ({"privileged": ("touch",)}, "agent.privileged names 'touch'"),
+        ({"privileged": ("wrist",)}, "agent.privileged names 'wrist'"),
         ({"privileged": ("state",), "fusion": "shared"}, "use --agent.fusion decoupled"),
         (
             {"keys": ("wrist",)},
@@ -108,9 +108,12 @@ def test_observation_of_a_user_environment_has_the_keys_of_the_agent() -> None:
     ],
 )
 def test_invalid_keys_are_refused_by_name(change: dict, message: str) -> None:  # type: ignore[type-arg]
-    agent = dataclasses.replace(AGENTS["merl"].config, **change)
     with pytest.raises(MerlError, match=message):
-        make_run_env(TrainConfig("reach_duplo", agent=agent, env=SMALL))
+        make_run_env(
+            TrainConfig(
+                "reach_duplo", agent=dataclasses.replace(AGENTS["merl"].config, **change), env=SMALL
+            )
+        )
 
 
 class ReplacesHandlers(DotEnv):

@@ -126,5 +126,5 @@ def test_correlated_noise_has_its_std_and_correlation_and_resumes() -> None:
 
 
 def test_correlation_of_one_is_rejected() -> None:
-    with pytest.raises(MerlError, match=r"agent.noise-correlation must lie in \[0, 1\), not 1"):
+    with pytest.raises(MerlError, match="noise-correlation must be at least 0 and below 1, not 1"):
         replace(CONFIG, noise_correlation=1.0)

@@ -17,7 +17,7 @@ from merl.accelerate import twins
 from merl.agents import AGENTS, ddpg
 from merl.bench.update import ACTIONS, learner_of, noise_batch
 from merl.core import UpdateNoise
-from merl.networks import encoders
+from merl.networks.encoders import frames
 
 DEVICE = torch.device("meta")
 
@@ -32,7 +32,7 @@ def _device(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(torch, "Generator", OnHost)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
-    for module in (encoders, twins):
+    for module in (frames, twins):
         monkeypatch.setattr(module, "compute_dtype", lambda weight: weight.dtype)
     monkeypatch.setattr(
         ddpg, "adam", lambda weights, *_, **__: torch.optim.Adam(weights, foreach=True)

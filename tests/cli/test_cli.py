@@ -470,7 +470,7 @@ def test_a_failed_command_does_not_change_its_output_file(tmp_path: Path) -> Non
 def test_none_is_not_offered_as_a_choice(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "nowhere", "--renderer", "wrap"]) == 2
     error = capsys.readouterr().err
-    assert "choose from raster, gl\n" in error
+    assert "choose from gl, raster\n" in error
     assert "None" not in error
 
 

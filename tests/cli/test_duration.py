@@ -45,7 +45,7 @@ def test_numbers_agree_with_their_nouns(number: float, text: str) -> None:
             {"minutes": 1.0},
             False,
             0,
-            f"{WHOLE} in at most 1 minute (their duration is printed after the first 50)",
+            f"{WHOLE} in at most 1 minute",
         ),
         ({}, False, 990, "10 steps of x:y on cpu"),
     ],

@@ -62,6 +62,17 @@ def test_a_second_signal_ends_the_process_immediately(number: int) -> None:
     assert done.stdout == b""
 
 
+def test_a_second_signal_raises_in_an_interactive_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It must not end a notebook's kernel, with all that it holds."""
+    monkeypatch.setattr("merl.core.signals._MIN_INTERVAL", 0.0)
+    monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
+    with Interrupt().listening() as interrupt:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert interrupt.number == signal.SIGINT
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
 def test_a_reminder_is_printed_after_some_seconds() -> None:
     program = (
         "import os, signal; from merl.core import signals\n"

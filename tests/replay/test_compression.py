@@ -67,8 +67,8 @@ def assert_right(batch: Batch, newest: int) -> None:
     assert timesteps[-1] == newest
     assert timesteps == [m for m in range(timesteps[0], newest + 1) if m % 7]
     for row, timestep in enumerate(timesteps):
-        begun = timestep - timestep % 7
-        stack = [max(begun, timestep - 1 - back) for back in (2, 1, 0)]
+        start = timestep - timestep % 7
+        stack = [max(start, timestep - 1 - back) for back in (2, 1, 0)]
         expected = np.stack([noise(m)["image"] for m in stack])
         np.testing.assert_array_equal(batch.observation["image"][row], expected)
 

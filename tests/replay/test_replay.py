@@ -705,10 +705,11 @@ def test_failed_growth_keeps_the_old_contents(tmp_path, monkeypatch, function, k
     monkeypatch.undo()
     assert (tmp_path / "part").exists() == killed
     run.replay = make(tmp_path)
+    assert not (tmp_path / "part").exists()
     check(run.replay, run.account)
     lengthen(run, 70)
     check(run.replay, run.account)
-    assert not (tmp_path / "part").exists()
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["73"]
 
 
 def test_smaller_capacity_samples_only_the_newest_steps(tmp_path):

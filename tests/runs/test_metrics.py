@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import merl
 from merl.core import MerlError
 from merl.report.curves import read_metrics
 from merl.runs import metrics
-from merl.runs.metrics import MetricsWriter
+from merl.runs.metrics import MetricsFile
 
 
 def rows(run):
@@ -22,14 +22,8 @@ def rows(run):
         return [*csv.reader(file)]
 
 
-def scalars(run, name):
-    accumulator = EventAccumulator(str(run / "tensorboard"))
-    accumulator.Reload()
-    return [(event.step, event.value) for event in accumulator.Scalars(name)]
-
-
 def test_each_step_has_a_row(tmp_path):
-    with MetricsWriter(tmp_path / "run") as writer:
+    with MetricsFile(tmp_path / "run") as writer:
         writer.write(250, {"train/return": 1.5})
         writer.write(500, {"train/return": np.float32(0.25)})
     assert rows(tmp_path / "run") == [["step", "train/return"], ["250", "1.5"], ["500", "0.25"]]
@@ -37,7 +31,7 @@ def test_each_step_has_a_row(tmp_path):
 
 def test_values_are_read_back_exactly(tmp_path):
     value = 0.1 + 0.2
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(1, {"a": value, "b": float("nan"), "c": 1e-300})
     back = read_metrics(tmp_path)
     assert back["a"][0] == value
@@ -46,7 +40,7 @@ def test_values_are_read_back_exactly(tmp_path):
 
 
 def test_a_column_may_be_added_later(tmp_path):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
         writer.write(2, {"b, c": 2.0})
         writer.write(3, {"a": 3.0})
@@ -59,7 +53,7 @@ def test_a_column_may_be_added_later(tmp_path):
 
 
 def test_writes_of_one_step_share_a_row(tmp_path):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(0, {"a": 1.0, "b": 1.0})
         writer.write(1, {"a": 1.23456789, "b": 1.23456789})
         writer.write(
@@ -78,7 +72,7 @@ def test_writes_of_one_step_share_a_row(tmp_path):
 
 
 def test_a_row_is_in_the_file_when_write_returns(tmp_path):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         for step in range(3):
             writer.write(step, {"a": 0.5})
             assert rows(tmp_path)[-1] == [str(step), "0.5"]
@@ -86,7 +80,7 @@ def test_a_row_is_in_the_file_when_write_returns(tmp_path):
 
 
 def test_write_refuses_earlier_steps_and_invalid_names(tmp_path):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(10, {"a": 1.0})
         with pytest.raises(ValueError, match=r"trim\(9\)"):
             writer.write(9, {"a": 1.0})
@@ -99,9 +93,9 @@ def test_write_refuses_earlier_steps_and_invalid_names(tmp_path):
 
 
 def test_an_existing_file_is_continued(tmp_path):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         assert writer.last_step == 1
         writer.write(1, {"b": 2.0})
         writer.write(2, {"b": 3.0})
@@ -111,7 +105,7 @@ def test_an_existing_file_is_continued(tmp_path):
 @pytest.mark.parametrize("torn", ["3", "3,1.0", "\0\0\0\0"])
 def test_an_incomplete_last_line_is_removed(tmp_path, torn):
     (tmp_path / "metrics.csv").write_text("step,a\n1,1.0\n2,2.0\n" + torn)
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(3, {"a": 3.5})
     assert rows(tmp_path)[1:] == [["1", "1.0"], ["2", "2.0"], ["3", "3.5"]]
 
@@ -119,21 +113,20 @@ def test_an_incomplete_last_line_is_removed(tmp_path, torn):
 def test_all_rows_are_kept_after_a_kill(tmp_path):
     code = (
         "import os, signal, sys\n"
-        "from merl.runs.metrics import MetricsWriter\n"
-        "writer = MetricsWriter(sys.argv[1])\n"
+        "from merl.runs.metrics import MetricsFile\n"
+        "writer = MetricsFile(sys.argv[1])\n"
         "for step in range(5): writer.write(step, {'a': step})\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", code, tmp_path], check=False)
     assert [row[0] for row in rows(tmp_path)[1:]] == ["0", "1", "2", "3", "4"]
-    assert len(scalars(tmp_path, "a")) == 5
 
 
 def test_trim_removes_later_steps(tmp_path):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         for step in (100, 200, 201, 300):
             writer.write(step, {"a": step})
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.trim(200)
         assert [row[0] for row in rows(tmp_path)] == ["step", "100", "200"]
         assert writer.last_step == 200
@@ -142,11 +135,10 @@ def test_trim_removes_later_steps(tmp_path):
     expected = [(100, 100), (200, 200), (250, -250), (300, -300)]
     back = read_metrics(tmp_path)
     assert [*zip(back["step"], back["a"], strict=True)] == expected
-    assert scalars(tmp_path, "a") == expected
 
 
 def test_trim_to_before_the_first_row(tmp_path):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(100, {"a": 1.0})
         writer.trim(0)
         assert writer.last_step is None
@@ -154,37 +146,12 @@ def test_trim_to_before_the_first_row(tmp_path):
     assert rows(tmp_path) == [["step", "a"], ["50", "2.0"]]
 
 
-def test_tensorboard_has_the_same_values(tmp_path):
-    with MetricsWriter(tmp_path) as writer:
-        writer.write(1, {"train/return": 1.5, "eval/success": 0.5})
-        writer.write(2, {"train/return": 2.5})
-    assert scalars(tmp_path, "train/return") == [(1, 1.5), (2, 2.5)]
-    assert scalars(tmp_path, "eval/success") == [(1, 0.5)]
-
-
-def test_prints_nothing_and_does_not_import_tensorflow(tmp_path):
-    (tmp_path / "tensorflow.py").write_text("raise SystemExit('TensorFlow was imported')")
-    code = (
-        "import sys\n"
-        "from merl.runs.metrics import MetricsWriter\n"
-        "with MetricsWriter(sys.argv[1]) as writer: writer.write(1, {'a': 1.0})\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-W", "default", "-c", code, tmp_path / "run"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONPATH": str(tmp_path)},
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
 @pytest.mark.parametrize("text", ["a,b\n1,2\n", "step,a\n1\n", "step,a\n2,1\n1,1\n", "step\nx\n"])
 def test_an_unreadable_file_is_not_overwritten(tmp_path, text):
     path = tmp_path / "metrics.csv"
     path.write_text(text)
     with pytest.raises(MerlError, match=r"metrics\.csv"):
-        MetricsWriter(tmp_path)
+        MetricsFile(tmp_path)
     assert path.read_text() == text
 
 
@@ -193,10 +160,10 @@ def interrupt(*_):
 
 
 def test_an_interrupt_between_memory_and_file_loses_no_row(tmp_path, monkeypatch):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
         with monkeypatch.context() as patch:
-            patch.setattr(metrics, "_write_whole", interrupt)
+            patch.setattr(metrics, "append_whole", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 writer.write(2, {"a": 2.0})
         writer.write(2, {"a": 3.0})
@@ -234,7 +201,7 @@ def disk(monkeypatch):
 
 def test_a_full_disk_does_not_end_a_run(tmp_path, disk):
     warnings = []
-    with MetricsWriter(tmp_path, warn=warnings.append) as writer:
+    with MetricsFile(tmp_path, warn=warnings.append) as writer:
         writer.write(1, {"a": 1.0})
         disk.full = True
         writer.write(2, {"a": 2.0})
@@ -254,13 +221,12 @@ def test_a_full_disk_does_not_end_a_run(tmp_path, disk):
         ["4", "4.0", ""],
         ["5", "5.0", ""],
     ]
-    assert scalars(tmp_path, "a") == [(1, 1.0), (5, 5.0)]
     assert len(warnings) == 1
 
 
 def test_close_writes_the_rows_that_a_full_disk_has_refused(tmp_path, disk, caplog):
     disk.full = True
-    with caplog.at_level(logging.WARNING), MetricsWriter(tmp_path) as writer:
+    with caplog.at_level(logging.WARNING), MetricsFile(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
         disk.full = False
     assert len(caplog.records) == 1
@@ -269,7 +235,7 @@ def test_close_writes_the_rows_that_a_full_disk_has_refused(tmp_path, disk, capl
 
 
 def test_unwritten_counts_the_rows_that_are_not_in_the_file(tmp_path, disk):
-    with MetricsWriter(tmp_path) as writer:
+    with MetricsFile(tmp_path) as writer:
         writer.write(1, {"a": 1.0})
         assert writer.unwritten == 0
         disk.full = True
@@ -284,3 +250,14 @@ def test_unwritten_counts_the_rows_that_are_not_in_the_file(tmp_path, disk):
         disk.full = True
         writer.write(5, {"b": 1.0})
     assert writer.unwritten == 1
+
+
+def test_resume_refuses_an_unreadable_file(tmp_path):
+    run = tmp_path / "run"
+    small = {"preset": "smoke", "steps": 20, "threads": 1, "eval.every": 0, "replay.batch_size": 4}
+    merl.train("merl.envs.dot:whole", run_dir=run, progress=False, **small)
+    (run / "metrics.csv").write_text("step,a\n1\n")
+    with pytest.raises(MerlError, match="is not a metrics file that can be continued"):
+        merl.resume(run, steps=40, progress=False)
+    assert (run / "metrics.csv").read_text() == "step,a\n1\n"
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["00000020"]

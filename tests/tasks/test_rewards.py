@@ -6,6 +6,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from merl.core.choices import RewardForm
 from merl.tasks import rewards
 
 NEAR, FAR = 0.0499, 0.0501  # on either side of epsilon_reaching
@@ -142,7 +143,7 @@ def test_every_term_and_their_sum_stay_within_bounds() -> None:
             height = draw.uniform(0.0351, 0.3) if off_floor else draw.uniform(-0.001, 0.035)
             goal = draw.uniform(0, 0.05) if at_goal else draw.uniform(0.05, 0.15)
             cosine = np.cos(np.radians(draw.uniform(0, 180)))
-            for form in get_args(rewards.RewardForm):
+            for form in get_args(RewardForm):
                 lifted = rewards.lift(hand, cosine, height, 0.18, goal, form=form)
                 moved = rewards.move(hand, goal, form=form)
                 for terms in (rewards.reach(hand), moved, lifted):

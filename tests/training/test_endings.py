@@ -350,7 +350,7 @@ def test_an_episode_without_end_is_saved_with_a_warning(
 ) -> None:
     """The run is interrupted after a save within the episode, and resumes from it."""
     monkeypatch.setattr("merl.training.meters.Interval.LEAST", 0.01)
-    monkeypatch.setattr("merl.training.trainer.LONG", 30)
+    monkeypatch.setattr("merl.training.meters.LONG", 30)
     unruly.length = 10**9
 
     def killed(env: Any, seen: Any) -> Any:

@@ -128,7 +128,7 @@ def test_a_long_episode_gives_a_warning(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The episodes of the task have 20 steps."""
-    monkeypatch.setattr("merl.training.trainer.LONG", limit)
+    monkeypatch.setattr("merl.training.meters.LONG", limit)
     flags = [*SHORT, "--agent", "proprio", "--run-dir", str(tmp_path / "r")]
     assert main(["train", "merl.envs.dot:whole", *flags]) == 0
     assert main(["resume", str(tmp_path / "r"), "--steps", "280"]) == 0
@@ -169,13 +169,10 @@ def test_only_training_and_evaluation_move_a_users_robot(
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     assert moves(tmp_path, "--eval.video", "none") == (10 + 2 + 3, 100 + 20)  # 3: comparing resets
     printed = " ".join(capsys.readouterr().out.split())
-    assert "100 steps of test_own_env:Logged on cpu (their duration is printed after" in printed
-    assert "49 steps of test_own_env:Logged on cpu take about 0:00:0" in printed
+    assert "100 steps of test_own_env:Logged on cpu" in printed
     assert "nothing to compare with (--eval.references takes 20 episodes" in printed
     assert moves(tmp_path) == (10 + 2 + 3 + 1, 100 + 20)  # 1: does it render?
     assert moves(tmp_path, "--eval.video", "none", "--eval.references") == (15 + 40, 120 + 400)
-    resets, steps = moves(tmp_path, "--eval.video", "none", "--measure")
-    assert (resets > 15, steps) == (True, 120 + 75)
 
 
 @pytest.mark.parametrize("agent", ["ddpg", "sac", "merl_state"])

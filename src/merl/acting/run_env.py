@@ -24,7 +24,7 @@ from merl.core.signals import handlers_kept
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
 from merl.envs.config import OBSERVATION_KINDS, EnvConfig, ObservationKey
-from merl.envs.user_env import make_user_env
+from merl.envs.user_env import MakeEnv, make_user_env
 from merl.envs.user_spaces import brief
 from merl.modalities import ObservationSpec
 
@@ -39,13 +39,16 @@ PLURALS: dict[Kind, str] = {
 _LOG = logging.getLogger(__name__)
 
 
-def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]:
+def make_run_env(
+    config: TrainConfig, make: MakeEnv | None = None, **changes: Any
+) -> gymnasium.Env[Any, Any]:
     """Make the environment of a run.
 
     Its observation has only the keys that the agent uses; other keys are not rendered.
 
     Args:
         config: the config of the run.
+        make: makes the environment, in place of `config.task`.
         **changes: fields of `EnvConfig` to change, and `render_mode`.
 
     Raises:
@@ -61,7 +64,7 @@ def make_run_env(config: TrainConfig, **changes: Any) -> gymnasium.Env[Any, Any]
                 "observations; leave the option out"
             )
         with handlers_kept():
-            env = Supervised(make_user_env(config.task, render_mode, config.user_env))
+            env = Supervised(make_user_env(config.task, render_mode, config.user_env, make))
         refuse_running_statistics(env)
     else:
         seen = dataclasses.replace(config.env, observations=_asked_for(config.agent, config.env))

@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.async_vector_env import AsyncState
+from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 
 from merl.acting.environments import Step, WorkerDied
@@ -32,8 +33,8 @@ from merl.config import TrainConfig
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
 from merl.core.output import tolerate_lost_output
 from merl.core.python_path import set_value, users_value, working_folder_hidden
-from merl.core.user_code import module_folder
-from merl.envs.user_env import imports_code, load_module
+from merl.core.user_code import in_one_line, module_folder
+from merl.envs.user_env import MakeEnv, imports_code, load_module
 
 _INFO = ("success", "reward_terms")
 """Keys of an environment's info that the training loop uses."""
@@ -58,12 +59,16 @@ class WorkerEnvs:
     Args:
         config: the config of the run; uses `num_envs` and `worker_timeout` (seconds).
         here: the same environment in this process; only its spaces are used.
+        make: makes the environment, in place of `config.task`; see `check_sendable`.
 
     Raises:
         EnvironmentsLost: the processes cannot be started.
     """
 
-    def __init__(self, config: TrainConfig, here: gymnasium.Env[Any, Any]) -> None:
+    def __init__(
+        self, config: TrainConfig, here: gymnasium.Env[Any, Any], make: MakeEnv | None = None
+    ) -> None:
+        self._make = make
         self.count, self.action_shape = config.num_envs, here.action_space.shape or ()
         self._config, self._here, self._timeout = config, here, config.worker_timeout
         self._lost: str | None = None  # why a process is lost
@@ -152,7 +157,8 @@ class WorkerEnvs:
             keys = ObservationConfig(agent.keys, agent.modalities, agent.privileged)
             config = replace(config, agent=keys)
         makers = [
-            _Maker(config, index, expected, self._here, folder) for index in range(self.count)
+            _Maker(config, index, expected, self._here, folder, self._make)
+            for index in range(self.count)
         ]
         others = multiprocessing.active_children()
         with (
@@ -165,6 +171,22 @@ class WorkerEnvs:
             # The exception of a worker is raised here; Gymnasium must not print it as well.
             gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
             return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+
+
+def check_sendable(config: TrainConfig, make: MakeEnv | None) -> None:
+    """Check that worker processes can receive the function that makes their environments.
+
+    Raises:
+        MerlError: the function refers to something that exists in this process alone.
+    """
+    try:
+        pickle.dumps(CloudpickleWrapper(lambda: make))  # as AsyncVectorEnv sends it
+    except Exception as error:
+        raise MerlError(
+            f"{config.task} cannot be sent to the worker processes of num-envs "
+            f"{config.num_envs} ({in_one_line(error)}): let the function make all that it uses, or "
+            "use num-envs 1 and synchronous"
+        ) from None
 
 
 @contextmanager
@@ -275,6 +297,7 @@ class _Maker:
     here: gymnasium.Env[Any, Any] | None
     folder: Path | None
     """The folder from which the module of a user's environment was loaded."""
+    make: MakeEnv | None
     safe_path: str | None = field(default_factory=users_value)
     """The user's value of `PYTHONSAFEPATH`, for Python processes that the environment starts."""
 
@@ -289,7 +312,7 @@ class _Maker:
         with _picklable_errors():
             if self.folder is not None:
                 load_module(self.config.task, self.folder)
-            env = make_run_env(self.config)
+            env = make_run_env(self.config, self.make)
         try:
             self.expected.check(EnvSpaces.of(self.config, env), f"that of worker {self.index}")
         except MerlError as error:

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from merl.cli.output import make_console
-from merl.cli.parsing import check_writable, parse, write_json
+from merl.cli.parsing import RunOptions, check_writable, parse, write_json
 from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
 from merl.core import MerlError
-from merl.core.fields import Range, check_fields
+from merl.core.fields import Range
 from merl.envs.config import RendererName
 from merl.evaluation.evaluation import EVALUATION_SEED
 from merl.evaluation.policy import load_policy
@@ -23,11 +21,9 @@ from merl.training.live_view import describe
 
 
 @dataclass(frozen=True)
-class EvaluateOptions:
+class EvaluateOptions(RunOptions):
     """Run a trained policy without exploration noise, from the fixed start states."""
 
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
     episodes: Annotated[int, Range(1)] = 10
     """Number of episodes."""
     video: Path | None = None
@@ -38,14 +34,11 @@ class EvaluateOptions:
     """latest, best (the highest evaluation return), or the step of a checkpoint."""
     renderer: RendererName | None = None
     """Renderer of the images; by default the one that the agent was trained with."""
-    trust: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Import the environment that the run names, although you have not trained this run here. This
-    runs the code of the run's author."""
     json: Path | None = None
     """Also write the seed, return and success of each episode to this file."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "--")
+        super().__post_init__()
         if self.video is not None and self.video.suffix.lower() not in ("", ".mp4"):
             raise MerlError(
                 f"--video {self.video}: videos are MP4; use {self.video.with_suffix('.mp4')}"
@@ -57,7 +50,8 @@ def evaluate(args: list[str]) -> int:
     options = parse(EvaluateOptions, "merl evaluate", args)
     check_writable(options.json)
     # Resolve paths before user code runs: it may change the working folder.
-    json_file, video_file = _absolute(options.json), _absolute(options.video)
+    json_file = options.json and options.json.absolute()
+    video_file = options.video and options.video.absolute()
     console = make_console()
     if options.trust:
         tell_trusted(Run.open(options.run))
@@ -89,7 +83,3 @@ def evaluate(args: list[str]) -> int:
         ]
         write_json(json_file, {"run": str(options.run), "step": policy.step, "episodes": rows})
     return 0
-
-
-def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else path.absolute()

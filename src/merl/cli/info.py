@@ -19,8 +19,6 @@ from merl.runs.provenance import machine, package_versions
 from merl.training.setup import Setup
 
 TASK = "reach_duplo"
-FEATURES = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
-"""Processor features that determine the speed of an update, by their names in Linux."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ def _rows() -> Iterator[tuple[str, str]]:
     yield from package_versions().items()
     hardware = machine()
     yield "processor", f"{hardware['processor']}, {counted(hardware['cores'], 'core')}"
-    yield "features", ", ".join(processor_features()) or f"none of {', '.join(FEATURES)}"
+    yield "instructions", hardware["instructions"]
     yield "GPU", hardware["gpu"] or "none found by torch"
     yield "memory", f"{available_memory() / 1e9:.1f} GB available to this process"
     yield "disk", f"{free_disk(Path.cwd()) / 1e9:.1f} GB free here"
@@ -54,15 +52,6 @@ def _rows() -> Iterator[tuple[str, str]]:
         yield f"renderer {name}", text
     for preset in ("laptop", "paper"):
         yield f"preset {preset}", _expected(preset)
-
-
-def processor_features() -> list[str]:
-    """Return those of `FEATURES` that this processor has."""
-    try:
-        words = set(Path("/proc/cpuinfo").read_text().split())
-    except OSError:
-        return []
-    return [feature for feature in FEATURES if feature in words]
 
 
 def _expected(preset: str) -> str:

@@ -6,15 +6,31 @@ import dataclasses
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
 from tyro import _errors  # no public hook for errors yet: pyproject.toml pins the version
 
 from merl.core import MerlError, suggest
+from merl.core.fields import check_fields
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of the commands that open a run."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    trust: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Import the environment that the run names, although you have not trained this run here. This
+    runs the code of the run's author."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "--")
 
 
 def parse(
@@ -70,7 +86,7 @@ def _message(event: _errors.ParseErrorEvent, options: Any) -> str | None:
         case _errors.UnrecognizedArgs(tokens=tokens):
             return _unknown(tokens, event.prog, options)
         case _errors.InvalidChoice(argument=argument, value=value, choices=choices):
-            known = [choice for choice in choices if choice != "None"]  # None: omit the flag
+            known = sorted({*choices} - {"None"})  # None: omit the flag
             return f"{argument.display_name()} {value!r} is unknown: {suggest(value, known)}"
         case _errors.BadValue(argument=argument):
             return f"{argument.display_name()} needs a value: {argument.lowered.metavar}"

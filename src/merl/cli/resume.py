@@ -2,39 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from merl.cli.parsing import parse
+from merl.cli.parsing import RunOptions, parse
 from merl.cli.running import go_on, tell_trusted
 from merl.config import Device
-from merl.core.fields import Range, check_fields
-from merl.runs.resume import reopened
+from merl.core.fields import Range
+from merl.runs.resume import resume_request
 from merl.runs.run import Run
 
 
 @dataclass(frozen=True)
-class ResumeOptions:
+class ResumeOptions(RunOptions):
     """Resume a run from its last checkpoint."""
 
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
     steps: Annotated[int, Range(1)] | None = None
     """Train to this total number of steps; by default to the run's own --steps."""
-    minutes: Annotated[float, Range(0, without=0)] | None = None
+    minutes: float | None = None
     """Stop after this many minutes from now; by default there is no time limit."""
     device: Device | None = None
     """Where the networks live from now on; by default where they were before."""
-    trust: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Import the environment and the agent that the run names, although you have not trained this
-    run here. This runs the code of the run's author."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "--")
 
 
 def resume(args: list[str]) -> int:
@@ -44,10 +32,5 @@ def resume(args: list[str]) -> int:
     if options.trust:
         tell_trusted(run)
     run = run.with_agent(trusted=options.trust)
-    asked = dataclasses.replace(
-        reopened(run.config),
-        steps=options.steps or run.config.steps,
-        minutes=options.minutes,
-        device=options.device or run.config.device,
-    )
+    asked = resume_request(run.config, options.steps, options.minutes, options.device)
     return go_on(run, asked, ["device"], trusted=options.trust)

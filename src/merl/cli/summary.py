@@ -10,12 +10,12 @@ from rich.table import Table
 
 from merl.acting.run_env import make_run_env
 from merl.config import TrainConfig
-from merl.core import MerlError, counted
+from merl.core import counted
 from merl.core.user_code import in_one_line
 from merl.evaluation.evaluation import Act, Evaluation, evaluate
 from merl.report.references import RANDOM, Reference, references
 from merl.runs.run_folder import resume_line
-from merl.training.trainer import Outcome
+from merl.training.outcome import Outcome
 
 FLOORS = (RANDOM, "no motion")
 """References that need no skill."""
@@ -43,7 +43,7 @@ def summarize(outcome: Outcome, console: Console) -> None:
         curve = learning_curve(run.path, run.path / "curve.png", references=lines)
         console.print(f"learning curve: {curve}", highlight=False, soft_wrap=True)
     except Exception as error:  # Matplotlib's errors too
-        console.print(f"the curve was not drawn: {_reason(error)}", highlight=False)
+        console.print(f"the curve was not drawn: {in_one_line(error)}", highlight=False)
     videos = sorted(run.videos.glob("*.mp4")) if run.videos.is_dir() else []
     if videos:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
@@ -112,13 +112,8 @@ def _measured(
     try:
         return floors(config, reports_success=reports_success)
     except Exception as error:
-        console.print(f"there is nothing to compare with: {_reason(error)}", highlight=False)
+        console.print(f"there is nothing to compare with: {in_one_line(error)}", highlight=False)
         return ()
-
-
-def _reason(error: Exception) -> str:
-    """Return an exception as one line."""
-    return str(error) if isinstance(error, MerlError) else in_one_line(error)
 
 
 def _verdict(known: Sequence[Reference], trained: Evaluation, updates: int) -> str:

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from rich.color import Color
 from rich.console import Console, Group
+from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
@@ -103,13 +105,9 @@ def _blocks(image: NDArray[np.uint8]) -> Text:
     text = Text()
     for upper, lower in zip(small[::2], small[1::2], strict=True):
         for top, bottom in zip(upper, lower, strict=True):
-            text.append("▀", style=f"rgb({_rgb(top)}) on rgb({_rgb(bottom)})")
+            text.append("▀", Style(color=Color.from_rgb(*top), bgcolor=Color.from_rgb(*bottom)))
         text.append("\n")
     return text
-
-
-def _rgb(pixel: NDArray[np.uint8]) -> str:
-    return ",".join(str(value) for value in pixel)
 
 
 def _write(path: Path, image: NDArray[np.uint8]) -> None:

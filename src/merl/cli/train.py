@@ -14,7 +14,7 @@ from merl.agents import AGENTS
 from merl.agents.config import ObservationConfig
 from merl.cli.parsing import parse
 from merl.cli.running import begin, go_on
-from merl.config import Setting, TrainConfig, flat
+from merl.config import Setting, Source, TrainConfig, flat
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import PRESETS, compose, default_preset
 from merl.runs.resume import decided, left_open
@@ -61,6 +61,7 @@ def train(args: list[str]) -> int:
     rest: list[str] = []
     first = parse(_First, PROG, args, rest=rest)
     preset = default_preset() if first.preset is None else first.preset
+    source = Source(preset, first.setting)
     composed = partial(compose, preset, agent=first.agent, setting=first.setting)
 
     def options(default: TrainConfig) -> TrainOptions:
@@ -87,7 +88,7 @@ def train(args: list[str]) -> int:
             return go_on(run, config, given_open, named_in=Path.cwd())
     why = "CUDA is available" if preset == "paper" else "CUDA is not available"
     reason = why if first.preset is None else "as requested"
-    return begin(config, f"preset {preset} ({reason}; {PRESETS[preset].about})")
+    return begin(config, source, f"preset {preset} ({reason}; {PRESETS[preset].about})")
 
 
 def _by_key(args: list[str], agent: ObservationConfig) -> dict[str, Any]:

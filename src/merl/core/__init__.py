@@ -1,6 +1,7 @@
 """Types, errors and small helpers that every package of merl may import."""
 
 from merl.core.errors import (
+    CallbackFailed,
     EnvironmentFailed,
     EnvironmentsLost,
     EvaluationFailed,
@@ -32,6 +33,7 @@ __all__ = [
     "Accelerable",
     "Agent",
     "Batch",
+    "CallbackFailed",
     "EnvironmentFailed",
     "EnvironmentsLost",
     "EvaluationFailed",

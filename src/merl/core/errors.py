@@ -46,6 +46,10 @@ class EvaluationFailed(MerlError):  # noqa: N818 (named after an event)
     exit_code = 4
 
 
+class CallbackFailed(MerlError):  # noqa: N818 (named after an event)
+    """A callback raised an exception: the run is saved and can be resumed."""
+
+
 def suggest(name: str, known: Iterable[str], closeness: float = 0.6) -> str:
     """Return a hint for an unknown name: the most similar known name, or else all known names.
 

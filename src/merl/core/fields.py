@@ -59,11 +59,7 @@ class Range:
 
 
 def check_fields(config: Any, prefix: str = "") -> None:
-    """Check the numbers, choices and tuples of a dataclass against their annotations.
-
-    Args:
-        config: the dataclass.
-        prefix: precedes the name of a field in messages, as on the command line: `agent.`.
+    """Check the numbers, choices and tuples of a dataclass; `prefix` precedes names in messages.
 
     Raises:
         MerlError: a value has another type, is unknown, or lies outside of its range.
@@ -79,17 +75,7 @@ def _hints(cls: type) -> Mapping[str, Any]:
 
 
 def check_value(name: str, value: Any, hint: Any, notes: Sequence[Any] = ()) -> None:
-    """Check one value against its annotation.
-
-    Args:
-        name: its name in messages.
-        value: the value.
-        hint: its type, which may be `Annotated`.
-        notes: further annotations beside the type.
-
-    Raises:
-        MerlError: see `check_fields`.
-    """
+    """Check one value against its type and the annotations beside it; see `check_fields`."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         check_value(name, value, parts[0], parts[1:])

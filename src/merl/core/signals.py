@@ -44,7 +44,10 @@ class Stopped(KeyboardInterrupt):
 
 @dataclass
 class Interrupt:
-    """A request by a signal to stop; a second signal ends the process immediately."""
+    """A request by a signal to stop; a second signal ends the process immediately.
+
+    In a notebook or a Python prompt, which must go on, it raises KeyboardInterrupt instead.
+    """
 
     _number: int | None = None
     _time: float = 0.0
@@ -66,8 +69,12 @@ class Interrupt:
     def listening(self) -> Iterator[Interrupt]:
         """Treat SIGINT, SIGTERM, SIGUSR1 and SIGHUP as a request to stop at the next safe point.
 
-        Signals that the process ignores, e.g. because of `nohup`, stay ignored.
+        Signals that the process ignores, e.g. because of `nohup`, stay ignored. Outside of Python's
+        main thread, which alone receives signals, nothing changes.
         """
+        if not _in_main_thread():
+            yield self
+            return
         handled = [number for number in _SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
         former = {number: signal.signal(number, self._handle) for number in handled}
         self._arrived, into = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -116,6 +123,8 @@ class Interrupt:
             self.note(number)
         # A closed terminal sends SIGHUP twice; the second one must not interrupt saving.
         elif number != signal.SIGHUP and time.monotonic() - self._time > _MIN_INTERVAL:
+            if hasattr(sys, "ps1"):  # an interactive session
+                raise KeyboardInterrupt
             with suppress(OSError, ValueError):  # the terminal was closed
                 if sys.stdout.isatty():  # the live view hides the cursor
                     os.write(sys.stdout.fileno(), SHOW_CURSOR.encode())
@@ -135,12 +144,16 @@ class handlers_kept:  # noqa: N801 (a context manager, used like a function)
 
     def __exit__(self, *_: object) -> None:
         """Restore the handlers; only Python's main thread may do so."""
-        if threading.current_thread() is threading.main_thread():
+        if _in_main_thread():
             for number, handler in self._former:
                 if handler is not None:  # None: set by another library before Python started
                     _signal(number, handler)
             if _wakeup:
                 signal.set_wakeup_fd(_wakeup[-1], warn_on_full_buffer=False)
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 def _print_reminder() -> None:

@@ -113,7 +113,12 @@ def _file_of(name: str) -> Path | None:
 
 
 def in_one_line(error: BaseException) -> str:
-    """Return an exception's type and text, and the last line in the user's files that led to it."""
+    """Return an exception's type and text, and the last line in the user's files that led to it.
+
+    Of a `MerlError`, whose message is made for the user, return only the message.
+    """
+    if isinstance(error, MerlError):
+        return str(error)
     try:
         text = " ".join(str(error).split())
     except Exception:  # the exception's own __str__ may fail

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from merl.core import Kind, MerlError
+from merl.core.choices import HandStart, ProprioSet, RewardForm, StateSet
 from merl.core.fields import NOT_EMPTY, Range, check_fields
 
 RendererName = Literal["gl", "raster"]
@@ -14,10 +15,6 @@ AUTO_RENDERER: RendererName = "raster"
 """The renderer that replaces `auto`. It works on every machine, and is the faster one where both
 were measured (docs/explanation/benchmarks.md). It does not depend on the machine, so the same code
 gives the same images everywhere."""
-ProprioName = Literal["paper", "full"]
-StateName = Literal["absolute", "relative"]
-StartName = Literal["above", "around", "holding", "carrying"]
-RewardName = Literal["paper", "staged"]
 ImageLayout = Literal["auto", "hwc", "chw"]
 ObservationKey = Literal["image", "depth", "proprio", "touch", "state"]
 OBSERVATION_KINDS: dict[ObservationKey, Kind] = {
@@ -52,11 +49,11 @@ class EnvConfig:
     pixel is the mean of its samples. An image takes as long as one of `samples` times the size: 24
     pixels with 3 samples take as long as 72 pixels with 1."""
 
-    proprio: ProprioName = "paper"
+    proprio: ProprioSet = "paper"
     """Content of `proprio`: `paper` (angles and velocities of arm and fingers, 24 numbers) or
     `full` (also joint torques and the hand's position and rotation, 42 numbers)."""
 
-    state: StateName = "absolute"
+    state: StateSet = "absolute"
     """Content of `state`: `absolute` (`full` proprioception, the object's pose and velocities, the
     target) or `relative` (also the vectors from hand to object and from object to target)."""
 
@@ -69,13 +66,13 @@ class EnvConfig:
     """Put a disc between the camera and the object, for `move_box` and `lift_box`. Where the camera
     does not see the object, the agent needs proprioception."""
 
-    start: Annotated[tuple[StartName, ...], NOT_EMPTY] = ("above",)
+    start: Annotated[tuple[HandStart, ...], NOT_EMPTY] = ("above",)
     """Where the hand starts: `above` (20 to 40 cm above the floor) or, for `move_box` and
     `lift_box`, `around` (open fingers around the box), `holding` (closed around the box) or
     `carrying` (closed around the box, anywhere on the way to the target). With several, each
     episode draws one."""
 
-    reward: RewardName = "paper"
+    reward: RewardForm = "paper"
     """Reward of `move_box` and `lift_box`: `paper` (Eqs. 4 and 5) or `staged` (the authors' later
     code, with one more term for the last centimetre)."""
 
@@ -95,11 +92,7 @@ class EnvConfig:
 
 
 def check_samples(samples: int, size: int) -> None:
-    """Reject more samples along an edge than the largest image has.
-
-    Args:
-        samples: samples along each edge of a pixel.
-        size: height and width of the image, in pixels.
+    """Reject more samples along an edge of an image of `size` pixels than `LARGEST_IMAGE`.
 
     Raises:
         MerlError: naming the values and the bound.

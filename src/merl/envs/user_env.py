@@ -5,6 +5,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import logging
+import re
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,6 +25,8 @@ from merl.envs.wrappers import adapt, failing
 
 BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that are part of merl."""
+MakeEnv = Callable[..., gymnasium.Env[Any, Any]]
+"""A function without arguments, or with `render_mode` alone, that makes an environment."""
 CLOSE = 0.8
 """Minimum similarity at which an unknown id counts as a misspelling of a known one."""
 
@@ -30,15 +35,20 @@ _LOG = logging.getLogger(__name__)
 
 
 def make_user_env(
-    task: str, render_mode: str | None = None, config: UserEnvConfig | None = None
+    task: str,
+    render_mode: str | None = None,
+    config: UserEnvConfig | None = None,
+    make: MakeEnv | None = None,
 ) -> gymnasium.Env[Any, Any]:
     """Make an environment that is not part of merl, in the form that agents use.
 
     Args:
         task: a Gymnasium id (`Pendulum-v1`, `module:Id-v0`), or `module:function`. The function is
-            called without arguments, or with `render_mode` if it accepts that.
+            called without arguments, or with `render_mode` if it accepts that. With `make`, only a
+            name for messages.
         render_mode: requested render mode; an environment that cannot render is made without it.
         config: how to interpret its spaces.
+        make: the function that makes the environment, in place of `task`.
 
     Returns:
         The environment, wrapped in `Adapted`.
@@ -46,15 +56,30 @@ def make_user_env(
     Raises:
         MerlError: there is no such environment, or agents cannot learn in it.
     """
-    env = _make(task, render_mode)
+    env = _make(task, render_mode, make)
     if render_mode is not None and not _renders(env):
         env.close()
-        env = _make(task, None)
+        env = _make(task, None, make)
     try:
         return adapt(env, config)
     except BaseException:
         env.close()
         raise
+
+
+def task_of(make: MakeEnv) -> tuple[str, MakeEnv | None]:
+    """Return the task of a function that makes an environment.
+
+    Returns:
+        `module:function` and None if the function can be imported by that name. Otherwise `name()`,
+        which a run cannot find again, and the function.
+    """
+    named = getattr(make, "func", make)  # of a functools.partial
+    name = getattr(named, "__qualname__", type(named).__name__)
+    module = getattr(make, "__module__", "__main__")
+    if module != "__main__" and getattr(sys.modules.get(module), name, None) is make:
+        return f"{module}:{name}", None
+    return re.sub(r"\W", "", name.rpartition(".")[2]) + "()", make
 
 
 def imports_code(task: str) -> bool:
@@ -75,7 +100,20 @@ def load_module(task: str, *folders: Path) -> ModuleType:
     return user_code.load_module(task, *folders, advice=installing(name, module))
 
 
-def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
+def _make(task: str, render_mode: str | None, make: Any = None) -> gymnasium.Env[Any, Any]:
+    if make is not None:
+        if not callable(make):
+            raise MerlError(
+                f"env is a {type(make).__name__}: give a function that makes it, such as `lambda: "
+                "gymnasium.make(...)`, because evaluations need an environment of their own"
+            )
+        return _checked(task, _call_function(task, make, render_mode))
+    if task.endswith("()"):
+        raise MerlError(
+            f"task {task!r} is a Python function, which the run does not record: pass it again, as "
+            "`env` of merl.resume or merl.evaluate (to train from the command line, name it as "
+            "module:function)"
+        )
     module, colon, name = task.partition(":")
     env_id = name if colon else task
     if env_id in ENV_IDS.values():
@@ -98,7 +136,10 @@ def _make(task: str, render_mode: str | None) -> gymnasium.Env[Any, Any]:
             f"task {task!r}: module {module!r} has no function {name!r}, and registers no "
             f"environment of that name{f': {way}' if way.startswith('did') else ''}"
         )
-    env = _call_function(task, make, render_mode)
+    return _checked(task, _call_function(task, make, render_mode))
+
+
+def _checked(task: str, env: Any) -> gymnasium.Env[Any, Any]:
     if not isinstance(env, gymnasium.Env):
         raise MerlError(f"task {task!r} returned {type(env).__name__}, not a gymnasium.Env")
     return env
@@ -116,7 +157,7 @@ def _call_function(task: str, make: Any, render_mode: str | None) -> Any:
             f"arguments, or only render_mode ({error})"
         ) from None
     try:
-        with failing(f"function {task.partition(':')[2]}"):
+        with failing(f"function {task.partition(':')[2] or task}"):
             return make(**given)
     except MerlError:
         if render_mode is None:

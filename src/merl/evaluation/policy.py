@@ -20,6 +20,7 @@ from merl.acting.run_env import make_run_env, own_bounds, run_spaces
 from merl.agents import make_agent
 from merl.config import TrainConfig
 from merl.core import Agent, MerlError, NotFinite, Observation
+from merl.envs.user_env import MakeEnv
 from merl.envs.user_spaces import UserKey
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.video import MIN_SIDE
@@ -89,10 +90,14 @@ class Policy:
         result: NDArray[np.float32] = action.to("cpu", torch.float32).numpy()
         return result
 
-    def make_env(self, *, trust: bool = False, **changes: Any) -> gymnasium.Env[Any, Any]:
+    def make_env(
+        self, *, env: MakeEnv | None = None, trust: bool = False, **changes: Any
+    ) -> gymnasium.Env[Any, Any]:
         """Make the environment of the run, with the start states of its evaluations.
 
         Args:
+            env: the function that makes the environment, if the run was trained with one; it is
+                used in place of the environment that the run names.
             trust: import the environment that the run names, although you have not trained this run
                 on this machine. This runs code of the author of the run. It is not needed for the
                 environments of merl and Gymnasium.
@@ -114,16 +119,16 @@ class Policy:
                 renderer,
             )
             changes.setdefault("samples", 1)  # the recorded value is for that renderer
-        if self._run is not None:
+        if self._run is not None and env is None:
             self._run.load_module(trusted=trust)
-        env = make_run_env(self.config.evaluated, **changes)
+        made = make_run_env(self.config.evaluated, env, **changes)
         if self._run is not None and self.config.own_env:
             try:
-                self._run.check_environment(*run_spaces(self.config, env), own_bounds(env))
+                self._run.check_environment(*run_spaces(self.config, made), own_bounds(made))
             except BaseException:
-                env.close()
+                made.close()
                 raise
-        return env
+        return made
 
     def evaluate(
         self,
@@ -132,6 +137,7 @@ class Policy:
         video: Path | None = None,
         renderer: str | None = None,
         max_episode_steps: int | None = None,
+        env: MakeEnv | None = None,
         trust: bool = False,
     ) -> Evaluation:
         """Run episodes without noise, from the evaluation's fixed start states.
@@ -142,6 +148,7 @@ class Policy:
             renderer: draws the images; None: the renderer of the training.
             max_episode_steps: limit in steps for episodes that do not end earlier; None: as in the
                 run.
+            env: see `make_env`.
             trust: see `make_env`.
 
         Raises:
@@ -158,11 +165,11 @@ class Policy:
         if max_episode_steps is not None:
             limits = dataclasses.replace(limits, max_episode_steps=max_episode_steps)
         config = dataclasses.replace(self.config, eval=limits)
-        env = self.make_env(trust=trust, **changes)
+        made = self.make_env(env=env, trust=trust, **changes)
         try:
             return evaluate(
                 self,
-                env,
+                made,
                 episodes,
                 reset=self.reset,
                 video=video,
@@ -170,7 +177,7 @@ class Policy:
                 reports_success=self.reports_success,
             )
         finally:
-            env.close()
+            made.close()
 
     def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
         if not isinstance(observation, Mapping):

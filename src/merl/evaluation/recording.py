@@ -78,7 +78,7 @@ class EpisodeVideo:
         except Exception as error:  # from the user's `render`, the encoder or the disk
             self.abort()
             self._writer = None
-            why = str(error) if isinstance(error, MerlError) else in_one_line(error)
+            why = in_one_line(error)
             if self._warn is None:
                 raise MerlError(f"the video {self._path} cannot be made: {why}") from error
             self._warn(f"there is no video of this evaluation: {why}")

@@ -13,7 +13,7 @@ import tyro
 
 from merl.agents import AGENTS, find_agent
 from merl.agents.config import AgentConfig
-from merl.config import EvaluationConfig, Setting, TrainConfig
+from merl.config import EvaluationConfig, Setting, TrainConfig, override
 from merl.core import MerlError, check_choice
 from merl.envs.config import EnvConfig
 from merl.envs.registration import ENV_IDS
@@ -113,37 +113,27 @@ PRESETS: dict[str, Preset] = {
     ),
 }
 
+_EVERY_STEP = {"updates_per_step": 1.0, "replay.batch_size": 256, "replay.n_step": 1}
 HEAD_LAYERS = {"move_box": 6, "lift_box": 6}
 """Layers of MERL's heads in preset `paper`, for tasks with other than three (MERL C.1)."""
 
 
-@dataclass(frozen=True)
-class Published:
-    """Values that an agent's authors used.
-
-    Attributes:
-        run: fields of `TrainConfig`.
-        replay: fields of `ReplayConfig`.
-        agent: fields of the agent's config.
-    """
-
-    run: Mapping[str, Any]
-    replay: Mapping[str, Any] = field(default_factory=dict)
-    agent: Mapping[str, Any] = field(default_factory=dict)
-
-
-PUBLISHED: dict[str, Published] = {
+PUBLISHED: dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
     # DrQ-v2's repository, for its tasks of medium difficulty: each action is held for two steps, an
     # update every second action, 2000 random actions, noise that falls over 500,000 actions.
-    "drqv2": Published(
-        {"action_repeat": 2, "updates_per_step": 0.25, "random_steps": 4000, "seed_steps": 4000},
-        {"batch_size": 256},
+    "drqv2": (
+        {
+            "action_repeat": 2,
+            "updates_per_step": 0.25,
+            "random_steps": 4000,
+            "seed_steps": 4000,
+            "replay.batch_size": 256,
+        },
         {"noise_steps": 1_000_000},
     ),
     # TD3's repository; its DDPG has noise in its actions and none in its updates.
-    "ddpg": Published(
-        {"updates_per_step": 1.0, "random_steps": 25_000, "seed_steps": 25_000},
-        {"batch_size": 256, "n_step": 1},
+    "ddpg": (
+        {"random_steps": 25_000, "seed_steps": 25_000, **_EVERY_STEP},
         {
             "learning_rate": 3e-4,
             "tau": 0.005,
@@ -153,13 +143,13 @@ PUBLISHED: dict[str, Published] = {
         },
     ),
     # Haarnoja et al. 2018b, Table 1; SAC's repository begins with ten episodes of random actions.
-    "sac": Published(
-        {"updates_per_step": 1.0, "random_steps": 10_000, "seed_steps": 10_000},
-        {"batch_size": 256, "n_step": 1},
+    "sac": (
+        {"random_steps": 10_000, "seed_steps": 10_000, **_EVERY_STEP},
         {"learning_rate": 3e-4, "tau": 0.005, "hidden_dim": 256},
     ),
 }
-"""Values that replace the preset's with `--setting published` (docs/explanation/agents/)."""
+"""Values that replace the preset's with `--setting published` (docs/explanation/agents/): those of
+the run and those of the agent's config."""
 
 
 def default_preset() -> str:
@@ -188,33 +178,27 @@ def compose(
     name = agent or chosen.agent_name
     base = find_agent(name, Path.cwd()).config
     check_choice("setting", setting, get_args(Setting))
-    config = dataclasses.replace(chosen.config, task=task, preset=preset, setting=setting)
-    if config.own_env:
-        config = dataclasses.replace(config, **chosen.own_env)
-    else:  # not for a user's environment: it may be a robot, which must not move unless asked
-        evaluation = dataclasses.replace(config.eval, references=True)
-        config = dataclasses.replace(config, eval=evaluation)
-    values = _agent_values(base, chosen, config) if isinstance(base, AgentConfig) else {}
+    config = dataclasses.replace(chosen.config, task=task)
+    # A user's environment may be a robot, which must not move unless asked.
+    config = override(config, chosen.own_env if config.own_env else {"eval.references": True})
+    values = _agent_values(base, preset, config) if isinstance(base, AgentConfig) else {}
     if setting == "published":
         if name not in PUBLISHED:
             raise MerlError(
                 f"agent {name!r} has no setting published: choose from {', '.join(PUBLISHED)}; for "
                 "the paper's values use preset paper"
             )
-        published = PUBLISHED[name]
-        replay = dataclasses.replace(config.replay, **published.replay)
-        config = dataclasses.replace(config, replay=replay, **published.run)
-        values = dict(published.agent)
+        config, values = override(config, PUBLISHED[name][0]), dict(PUBLISHED[name][1])
     if base.keys and name in AGENTS and task not in ENV_IDS:  # only merl's tasks have `state`
         values |= {"keys": None, "modalities": ("vector", "sequence")}
     made = dataclasses.replace(base, **values)
     return dataclasses.replace(config, agent_name=name, agent=made)
 
 
-def _agent_values(base: AgentConfig, preset: Preset, config: TrainConfig) -> dict[str, Any]:
+def _agent_values(base: AgentConfig, preset: str, config: TrainConfig) -> dict[str, Any]:
     """Return the values of a preset for an agent that is based on merl's learner."""
-    values = dict(preset.agent)
-    if config.preset == "paper" and base.head_norm:
+    values = dict(PRESETS[preset].agent)
+    if preset == "paper" and base.head_norm:
         values["head_layers"] = HEAD_LAYERS.get(config.task, base.head_layers)
     if base.noise_std_end is not None:  # the noise falls within the run
         values["noise_steps"] = min(base.noise_steps, config.steps // 2)

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from merl.agents import AGENTS
-from merl.config import EvaluationConfig, TrainConfig
+from merl.config import EvaluationConfig, Source, TrainConfig
 from merl.envs.config import EnvConfig
 from merl.envs.user_env import make_user_env
 from merl.evaluation.evaluation import EVALUATION_SEED, Evaluation
@@ -68,7 +68,6 @@ def small_config(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) 
         values |= {"noise_steps": steps // 2}
     return TrainConfig(
         task,
-        preset="small",
         agent_name=agent,
         seed=seed,
         steps=steps,
@@ -88,7 +87,7 @@ def small_config(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) 
 def learn(case: Case, *, seed: int, run_dir: Path, evaluations: int = 1) -> Evaluation:
     """Train, with evaluations of 20 episodes without noise; return the last evaluation."""
     config = small_config(case, seed=seed, run_dir=run_dir, evaluations=evaluations)
-    with Trainer(config) as trainer:
+    with Trainer(config, source=Source("small")) as trainer:
         outcome = trainer.fit()
     assert outcome.evaluation is not None
     return outcome.evaluation

@@ -46,8 +46,9 @@ class Journal:
     def keep(self, ring: int, timestep: int, ranges: Iterable[tuple[str, int, int]]) -> None:
         """Record bytes before a timestep overwrites them.
 
-        If the file cannot be written (the disk is full), the journal warns once and records nothing
-        until the next checkpoint: resuming from the last one loses the overwritten timesteps.
+        If the file cannot be written (the disk is full), the journal warns, removes all records,
+        and records nothing until the next checkpoint: resuming from the last one loses the
+        overwritten timesteps.
 
         Args:
             ring: number of the ring.
@@ -61,14 +62,14 @@ class Journal:
             index = self._index[name]
             record += _HEAD.pack(ring, timestep, index, begin, count)
             record += self._arrays[index][begin : begin + count].data
-        end = self._file.seek(0, 2)
         reason = "the disk is full"
         try:
-            self._is_complete = self._file.write(record) == len(record)
+            whole = self._file.write(record) == len(record)
         except OSError as error:
-            self._is_complete, reason = False, error.strerror or str(error)
-        if not self._is_complete:
-            self._file.truncate(end)
+            whole, reason = False, error.strerror or str(error)
+        if not whole:
+            self.empty()
+            self._is_complete = False
             _LOG.warning(
                 "cannot write the replay's journal: %s; until the next checkpoint, resuming loses "
                 "the oldest steps of the replay",

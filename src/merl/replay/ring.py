@@ -193,14 +193,15 @@ class EpisodeRing:
             spec.check(name, values[name])
             if key in self._frames:
                 encoded[key] = self._frames[key].encode(np.asarray(values.pop(name)))
-        timestep = self.timesteps + 1
+        timestep, data = self.timesteps + 1, self._data
+        slot = self._slot(timestep)
         self._make_room(timestep, encoded)
         for key, frame in encoded.items():
-            self._bytes[key].write(self._row(timestep), frame)
+            self._bytes[key].write(self._base + slot, frame)
         values |= {"position": position, "reward": reward, "discount": discount}
         for name, value in values.items():
-            self._data[name][self._slot(timestep)] = value
-        self._data["timestep"][self._slot(timestep)] = self.timesteps = timestep
+            data[name][slot] = value
+        data["timestep"][slot] = self.timesteps = timestep
         self._forget()
 
     def _make_room(self, timestep: int, encoded: Mapping[str, bytes]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 from urllib.parse import quote
 
@@ -184,6 +184,7 @@ class ReplaySpec:
         return self.rings * self.slots * sum(field.bytes for field in self.fields.values())
 
 
+@cache
 def field_name(key: str) -> str:
     """Return the field of an observation key; also a file name, so a slash is quoted."""
     return f"observation.{quote(key, safe='')}"

@@ -69,6 +69,7 @@ def open_files(directory: Path, spec: ReplaySpec) -> Storage:
             return storage
     folder = max(folders, key=lambda path: int(path.name))
     _check(folder, spec)
+    _remove_others(folder)
     return _mapped(folder, spec, int(folder.name))
 
 
@@ -104,9 +105,7 @@ def new_files(directory: Path, spec: ReplaySpec) -> Iterator[Storage]:
             why = error.strerror or error
             raise MerlError(f"cannot store a replay in {directory}: {why}") from error
         raise
-    for folder in directory.iterdir():
-        if folder.name.isdecimal() and folder.name != str(spec.slots):
-            shutil.rmtree(folder, ignore_errors=True)
+    _remove_others(directory / str(spec.slots))
 
 
 def _mapped(folder: Path, spec: ReplaySpec, slots: int) -> Storage:
@@ -116,6 +115,13 @@ def _mapped(folder: Path, spec: ReplaySpec, slots: int) -> Storage:
             files[name] = mmap.mmap(file.fileno(), spec.rings * slots * field.bytes)
         arrays[name] = np.frombuffer(files[name], field.dtype).reshape(-1, *field.shape)
     return Storage(slots, arrays, files)
+
+
+def _remove_others(folder: Path) -> None:
+    """Remove files that this folder replaces, and incomplete files of a process that died."""
+    for other in folder.parent.iterdir():
+        if other != folder and (other.name == _PART or other.name.isdecimal()):
+            shutil.rmtree(other, ignore_errors=True)
 
 
 def _check(folder: Path, spec: ReplaySpec) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -10,11 +11,11 @@ from merl.core import MerlError
 
 HARMLESS = (
     "steps",
-    "measure",
     "minutes",
     "worker_restarts",
     "worker_timeout",
     "save_every",
+    "log",
     "keep",
     "device",
     "threads",
@@ -46,8 +47,6 @@ _DECIDED = {
 }
 REOPENED = ("threads", "agent.precision", "agent.torch_compile")
 """Fields that are chosen again on another machine if the user left them open."""
-_NAMES = ("run_dir", "preset", "setting")
-"""Fields that only name the folder of the run or the source of other values."""
 
 
 def left_open(config: TrainConfig) -> tuple[str, ...]:
@@ -64,10 +63,7 @@ def reopened(config: TrainConfig, names: Iterable[str] = REOPENED) -> TrainConfi
 
 
 def decided(config: TrainConfig) -> TrainConfig:
-    """Return a config in which device, threads, precision and compilation have fixed values.
-
-    The values are arbitrary.
-    """
+    """Return a config in which device, threads, precision and compilation are not left open."""
     return _with_known(config, _DECIDED)
 
 
@@ -75,6 +71,22 @@ def _with_known(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
     """Return a config with other values of the fields that it has; a user's agent lacks some."""
     known = flat(config)
     return override(config, {name: value for name, value in values.items() if name in known})
+
+
+def resume_request(
+    recorded: TrainConfig, steps: int | None, minutes: float | None, device: Any = None
+) -> TrainConfig:
+    """Return the config that asks to resume a run with other values; None keeps the recorded one.
+
+    Raises:
+        MerlError: a value is out of its range.
+    """
+    return dataclasses.replace(
+        reopened(recorded),
+        steps=recorded.steps if steps is None else steps,
+        minutes=minutes,
+        device=device or recorded.device,
+    )
 
 
 def merge_resume_config(
@@ -99,7 +111,7 @@ def merge_resume_config(
         name: (before.get(name), after.get(name))
         for name in {**before, **after}
         if before.get(name) != after.get(name)
-        and name not in _NAMES
+        and name != "run_dir"
         and not (recorded.own_env and name.startswith("env."))  # only for merl's own tasks
         and name != "minutes"  # counted since the resume
         and (name in given_open or name not in open_fields)

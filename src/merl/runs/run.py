@@ -2,7 +2,7 @@
 
 config.json     config, spaces, versions, commit, machine
 metrics.csv     the metrics, one row per episode and evaluation (authoritative)
-tensorboard/    the same metrics as TensorBoard events
+tensorboard/    the same metrics as TensorBoard events, with `--log tensorboard`
 checkpoints/    the checkpoints from which the run resumes
 replay/         the memory-mapped replay buffer
 videos/         one episode of each filmed evaluation
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import uuid
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from gymnasium import spaces
 from merl.agents import find_agent
 from merl.agents.config import UnloadedConfig
 from merl.agents.networks import own_encoders
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, user_code
 from merl.envs.user_env import imports_code, load_module
 from merl.runs import record, trust
@@ -32,12 +33,7 @@ from merl.runs.plain import from_plain
 from merl.runs.provenance import machine
 from merl.runs.record import FORMAT, Bounds
 from merl.runs.resume import REOPENED
-from merl.runs.run_folder import (
-    create_folder,
-    discard_folder,
-    lock_folder,
-    refuse_existing,
-)
+from merl.runs.run_folder import create_folder, discard_folder, lock_folder, refuse_existing
 from merl.runs.trust import Origin
 
 
@@ -68,6 +64,7 @@ class Run:
         bounds: Bounds | None = None,
         left_open: tuple[str, ...] = REOPENED,
         *,
+        source: Source = CUSTOM,
         home: Path | None = None,
     ) -> Iterator[Run]:
         """Create the folder of a new run, lock it, and write its config; unlock it at the end.
@@ -79,13 +76,14 @@ class Run:
             bounds: the bounds of the environment's actions before rescaling; None if they are not
                 rescaled.
             left_open: names of the fields that the user left open.
+            source: where the config's values come from.
             home: see `run_path`.
 
         Raises:
             MerlError: the folder holds other files, cannot be created, or is in use by another
                 process.
         """
-        path, created = create_folder(config, home)
+        path, created = create_folder(config, source, home)
         run = cls(path, config, left_open, created)
         with ExitStack() as stack:
             try:
@@ -102,8 +100,7 @@ class Run:
                     "id": trust.identity(),
                     "task": config.task,
                     "agent": config.agent_name,
-                    "preset": config.preset,
-                    "setting": config.setting,
+                    **dataclasses.asdict(source),
                     "seed": config.seed,
                     **record.describe_config(config, left_open),
                     **record.describe_spaces(observation_space, action_space, bounds),
@@ -273,6 +270,11 @@ class Run:
     def lock(self) -> AbstractContextManager[None]:
         """Lock the folder so that no other process trains in it; see `lock_folder`."""
         return lock_folder(self.path)
+
+    @property
+    def public_id(self) -> str:
+        """Return an id of the run that may be published; `trust` keeps the recorded one secret."""
+        return uuid.uuid5(uuid.UUID(record.read(self.path)["id"]), "merl").hex
 
     @property
     def checkpoints(self) -> Path:

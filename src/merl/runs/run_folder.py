@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from merl.config import TrainConfig
+from merl.config import Source, TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError
 
 LOCK_FILE = "lock"
@@ -23,11 +23,12 @@ _FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, PART, LOCK_FILE)
 _FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 
 
-def run_path(config: TrainConfig, home: Path | None = None) -> Path:
+def run_path(config: TrainConfig, source: Source, home: Path | None = None) -> Path:
     """Return the folder that a config names, or else the first unused default folder.
 
     Args:
         config: the config of the run.
+        source: where its values come from.
         home: the base of a relative path; the working folder if None.
 
     Returns:
@@ -36,8 +37,8 @@ def run_path(config: TrainConfig, home: Path | None = None) -> Path:
     home = Path.cwd() if home is None else home
     if config.run_dir is not None:
         return home / config.run_dir
-    agent = config.agent_name if config.setting == "matched" else f"{config.agent_name}-published"
-    name = f"{config.task}-{agent}-{config.preset}-s{config.seed}"
+    agent = config.agent_name if source.setting == "matched" else f"{config.agent_name}-published"
+    name = f"{config.task}-{agent}-{source.preset}-s{config.seed}"
     name = re.sub(r"[^\w.-]+", "-", name)  # `module:function`, `namespace/Id-v0`
     runs = home / "runs"
     numbered = (runs / f"{name}-{number}" for number in itertools.count(2))
@@ -76,7 +77,7 @@ def holds_nothing(path: Path) -> bool:
         return False
 
 
-def create_folder(config: TrainConfig, home: Path | None) -> tuple[Path, bool]:
+def create_folder(config: TrainConfig, source: Source, home: Path | None) -> tuple[Path, bool]:
     """Create the folder of a new run.
 
     Returns:
@@ -86,7 +87,7 @@ def create_folder(config: TrainConfig, home: Path | None) -> tuple[Path, bool]:
         MerlError: the folder holds other files, or cannot be created.
     """
     while True:
-        path = run_path(config, home)
+        path = run_path(config, source, home)
         refuse_existing(path)
         try:
             path.mkdir(parents=True)
@@ -142,13 +143,11 @@ def discard_folder(run: Path, created: bool) -> None:
         run: the folder.
         created: this process has created the folder, so the folder is deleted, too.
     """
-    for name in (*_FOLDERS, *_FILES):
-        path = run / name
-        if name in _FOLDERS:
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
+    for name in _FOLDERS:
+        shutil.rmtree(run / name, ignore_errors=True)
+    for name in _FILES:
+        with suppress(OSError):
+            (run / name).unlink(missing_ok=True)
     if created:
         with suppress(OSError):  # the folder holds files of others
             run.rmdir()

@@ -5,25 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from merl.core import MerlError, suggest
+from merl.core.choices import HandStart, RewardForm
 from merl.tasks.simulator import check_versions  # first: it loads MuJoCo without OpenGL
 
 # isort: split
-from merl.tasks.box import ABOVE, BoxTask, HandStart
+from merl.tasks.box import ABOVE, BoxTask
 from merl.tasks.jaco import JacoTask
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
-from merl.tasks.rewards import RewardForm
 
 __all__ = [
     "BOX_TASKS",
     "TASKS",
-    "HandStart",
     "JacoTask",
     "LiftBox",
     "MoveBox",
     "ReachDuplo",
-    "RewardForm",
     "check_versions",
     "make_task",
 ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Literal
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -12,8 +11,9 @@ from dm_control.composer.variation import distributions
 from dm_control.entities import props
 from dm_control.manipulation.shared import workspaces
 
+from merl.core.choices import HandStart, RewardForm
 from merl.tasks.jaco import Box, JacoTask, Position
-from merl.tasks.rewards import SUCCESS_DISTANCE, RewardForm
+from merl.tasks.rewards import SUCCESS_DISTANCE
 from merl.tasks.simulator import quiet_inverse_kinematics
 
 BOX_HALF_SIZE = 0.025
@@ -35,9 +35,6 @@ CLOSING_VELOCITY = 1.0
 """Velocity of the fingers that close around the box before an episode, rad/s."""
 CLOSING_STEPS = 20
 """Number of control steps in which the fingers close; enough for the widest start."""
-HandStart = Literal["above", "around", "holding", "carrying"]
-"""Where the hand starts: above the workspace, open around the box, closed around the box, or closed
-around the box on the way to the target."""
 ABOVE: tuple[HandStart, ...] = ("above",)
 """The start in dm_control, and the only one of a plain `JacoTask`."""
 _RED = (1.0, 0.0, 0.0, 1.0)

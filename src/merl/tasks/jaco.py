@@ -8,7 +8,7 @@ workspace, z points up, and the camera looks along +y at the arm, which stands b
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -18,6 +18,7 @@ from dm_control.entities.manipulators import kinova
 from dm_control.manipulation.shared import arenas, cameras, workspaces
 from numpy.typing import NDArray
 
+from merl.core.choices import ProprioSet, StateSet
 from merl.tasks.simulator import quiet_inverse_kinematics
 
 CONTROL_TIMESTEP = 0.04
@@ -29,8 +30,6 @@ ARM_OFFSET = (0.0, 0.4, 0.0)
 CAMERA = cameras.FRONT_CLOSE
 """The fixed camera in front of the arm: its name, position (m) and axes (dm_control)."""
 
-ProprioSet = Literal["paper", "full"]
-StateSet = Literal["absolute", "relative"]
 TOUCH_SIZE = 7
 """Number of touch sensors: the palm, and for each finger its first link and its tip."""
 PROPRIO_SIZES: dict[ProprioSet, int] = {"paper": 24, "full": 42}

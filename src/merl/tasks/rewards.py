@@ -6,9 +6,9 @@ Each term is in [0, 1/N], where N is the number of stages (terms). Their sum is 
 
 from __future__ import annotations
 
-from typing import Literal
-
 from dm_control.utils.rewards import tolerance
+
+from merl.core.choices import RewardForm
 
 REACHING_DISTANCE = 0.05
 """epsilon_reaching, m: the hand is at the object if its tool centre point is closer than this."""
@@ -36,13 +36,6 @@ FLOATING_BELOW_TARGET = 0.01
 FLOATING_SLOPE = 2.0
 """Factor of the `floating` term of `staged`, which therefore has its maximum half-way up."""
 
-RewardForm = Literal["paper", "staged"]
-"""Form of the reward, for tasks with a target.
-
-- `paper`: Eqs. 4 and 5 with epsilon_pushing = epsilon_lifting = 0.05 as bound and margin.
-- `staged`: the authors' later code. It adds a `success` term (N = 3 and 5). `floating` is steeper,
-  and is 0 unless the object is off the floor.
-"""
 Terms = dict[str, float]
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from merl.callbacks import Callback
 from merl.core import EvaluationFailed, MerlError
 from merl.core.signals import Interrupt
 from merl.core.user_code import in_one_line
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.policy import Policy
-from merl.runs.metrics import MetricsWriter
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
-from merl.training.callbacks import Callback
 from merl.training.meters import Clock
 from merl.training.setup import Setup
 
@@ -31,25 +30,27 @@ class Evaluations:
     Args:
         setup: agent, environment and progress.
         run: the run's folder.
-        metrics: receives the results.
+        clock: provides the training time of the run.
         callbacks: notified of evaluations and warnings.
         interrupt: signals; the first one ends an evaluation immediately.
 
     Attributes:
         last: the last evaluation; None before the first.
+        row: the metrics of the last evaluation, by their names in `metrics.csv`.
     """
 
     def __init__(
         self,
         setup: Setup,
         run: Run,
-        metrics: MetricsWriter,
+        clock: Clock,
         callbacks: Callback,
         interrupt: Interrupt,
     ) -> None:
         self._setup, self._config, self._run = setup, setup.config, run
-        self._metrics, self._callbacks, self._interrupt = metrics, callbacks, interrupt
+        self._clock, self._callbacks, self._interrupt = clock, callbacks, interrupt
         self.last: Evaluation | None = None
+        self.row: dict[str, float] = {}
         self._warned = set[str]()
 
     def are_due(self) -> bool:
@@ -59,12 +60,11 @@ class Evaluations:
             return False
         return progress.step // every > progress.evaluated // every
 
-    def run(self, save: Callable[[], bool], clock: Clock, *, last: bool = False) -> None:
+    def run(self, save: Callable[[], bool], *, last: bool = False) -> None:
         """Save a checkpoint, so that a failing evaluation loses no training, and evaluate.
 
         Args:
             save: writes a checkpoint; returns whether it is on the disk.
-            clock: provides the training time of the run.
             last: whether this is the evaluation at the end of training.
 
         Raises:
@@ -89,8 +89,8 @@ class Evaluations:
         self._run.check_there()
         progress.evaluated, progress.attempts = progress.step, 0
         progress.reports_success |= self.last.success_end is not None
-        values = {f"eval/{name}": value for name, value in self.last.metrics().items()}
-        self._metrics.write(progress.step, values | {"time/seconds": clock.seconds()})
+        self.row = {f"eval/{name}": value for name, value in self.last.metrics().items()}
+        self.row["time/seconds"] = self._clock.seconds()
         self._callbacks.on_evaluation(progress.step, self.last)
         if previous is not None and not self.last.starts_as(previous):
             self._warn_once(
@@ -126,7 +126,7 @@ class Evaluations:
         resumed run does not end with the same failure again.
         """
         self._run.check_there()
-        why = str(error) if isinstance(error, MerlError) else in_one_line(error)
+        why = in_one_line(error)
         if self._setup.progress.attempts > 1:
             self._skip(f"failed again: {why}")
             return

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import csv
+import io
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import timedelta
+from importlib import import_module
 from statistics import mean
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console, Group
@@ -17,14 +18,15 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from merl.callbacks import Callback
 from merl.core import METRICS_FILE, counted
 from merl.evaluation.evaluation import Evaluation
-from merl.runs.run import Run
-from merl.training.callbacks import Callback
+from merl.runs.metrics import read_rows
 from merl.training.loop import StepResult
 
 if TYPE_CHECKING:
-    from merl.training.trainer import Outcome, Trainer
+    from merl.training.outcome import Outcome
+    from merl.training.trainer import Trainer
 
 RECENT = 10
 """Number of training episodes in the shown means."""
@@ -37,18 +39,22 @@ SPARK_WIDTH = 40
 
 
 class LiveView(Callback):
-    """View of a run: a live table on a terminal, plain lines in other output.
+    """View of a run: a live table in a terminal or a notebook, plain lines in other output.
 
     Args:
-        console: where to print.
+        console: where to print; by default the standard output.
         scale: {name: return} of references, e.g. random actions and an expert, from the lowest to
             the highest return; empty if unknown.
     """
 
-    def __init__(self, console: Console, scale: Mapping[str, float] | None = None) -> None:
-        self.console = console
+    def __init__(
+        self, console: Console | None = None, scale: Mapping[str, float] | None = None
+    ) -> None:
+        is_notebook = console is None and Console().is_jupyter
+        # Jupyter asks for colours as a terminal does, but does not move the cursor.
+        plain: Any = {"force_jupyter": False, "force_terminal": False} if is_notebook else {}
+        self.console = console or Console(markup=False, highlight=False, **plain)
         self._scale = dict(scale or {})
-        self._is_live = console.is_interactive
         self._speed = self._training = self._learner = self._evaluation = self._note = ""
         self._recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
         self._returns: list[float] = []  # mean returns of all evaluations
@@ -57,14 +63,16 @@ class LiveView(Callback):
         self._minutes: float | None = None
         self._start = self._printed = time.perf_counter()
         self._learning_since: tuple[float, int] | None = None  # time and step of the first update
-        # Rich draws in another thread: replace objects, do not change them in place.
-        self._live = Live(
-            console=console, refresh_per_second=4, transient=False, get_renderable=self._draw
-        )
+        self._live: Live | _Cell | None = None
+        if is_notebook:
+            self._live = _Cell(self._draw)
+        elif self.console.is_interactive:
+            # Rich draws in another thread: replace objects, do not change them in place.
+            self._live = Live(console=self.console, refresh_per_second=4, get_renderable=self._draw)
 
     def on_end(self, outcome: Outcome | None) -> None:
-        """Draw the table for the last time and leave it on the terminal."""
-        if self._live.is_started:
+        """Draw the table for the last time and leave it there."""
+        if self._live is not None and self._live.is_started:
             self._live.refresh()
             self._live.stop()
 
@@ -74,11 +82,12 @@ class LiveView(Callback):
         self._total, self._minutes = config.steps, config.minutes
         self._step = trainer.setup.progress.step
         self._learning_starts = config.seed_steps
-        self._returns = _earlier_returns(run)
+        _, rows = read_rows(run.path / METRICS_FILE)  # of a resumed run
+        self._returns = [float(row["eval/return"]) for row in rows if "eval/return" in row]
         every = config.eval.every
         self._evaluation = f"first one after step {every:,}, or at the end" if every else ""
         self._start = self._printed = time.perf_counter()
-        if self._is_live:
+        if self._live is not None:
             self._live.start()
         elif self._scale:
             self._print(f"returns to compare with: {self._references()}")
@@ -88,6 +97,7 @@ class LiveView(Callback):
         self._step, self._updates = result.step, result.updates
         if self._learning_since is None and result.updates:
             self._learning_since = time.perf_counter(), result.step
+        self._update_cell()
         return None
 
     def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
@@ -103,7 +113,7 @@ class LiveView(Callback):
             self._learner = (
                 f"Q {metrics['learn/q']:.2f}, critic loss {metrics['learn/critic_loss']:.2g}"
             )
-        if not self._is_live and time.perf_counter() - self._printed > PLAIN_INTERVAL:
+        if self._live is None and time.perf_counter() - self._printed > PLAIN_INTERVAL:
             self._printed = time.perf_counter()
             left = self._time_left()
             self._print(
@@ -114,13 +124,14 @@ class LiveView(Callback):
     def on_evaluation_step(self, episode: int, total: int) -> None:
         """Show that an evaluation is in episode `episode` (from 0) of `total`."""
         self._note = f"evaluating: episode {episode + 1} of {total}"
+        self._update_cell()
 
     def on_evaluation(self, step: int, evaluation: Evaluation) -> None:
         """Show the result of an evaluation."""
         self._note = ""
         self._returns = [*self._returns, evaluation.returns.mean]
         self._evaluation = f"at step {step:,}: {describe(evaluation)}"
-        if not self._is_live:
+        if self._live is None:
             self._print(f"evaluation {self._evaluation}{self._low_return_note()}")
             if len(self._returns) > 1:
                 self._print(f"returns of all evaluations: {self._sparkline()}")
@@ -135,6 +146,10 @@ class LiveView(Callback):
 
     def _print(self, line: str) -> None:
         self.console.print(line, highlight=False, soft_wrap=True)
+
+    def _update_cell(self) -> None:
+        if isinstance(self._live, _Cell):
+            self._live.update()
 
     def _draw(self) -> Group:
         """Return the live table."""
@@ -224,6 +239,41 @@ class LiveView(Callback):
         return f"{line} (scale: {low:.1f} to {high:.1f})"
 
 
+class _Cell:
+    """Text in the output of a notebook's cell, replaced twice a second; it needs no widgets.
+
+    Args:
+        draw: returns what to show.
+    """
+
+    def __init__(self, draw: Callable[[], Group]) -> None:
+        self._draw, self._shown = draw, 0.0
+        self._handle: Any = None
+
+    @property
+    def is_started(self) -> bool:
+        return self._handle is not None
+
+    def start(self) -> None:
+        display = import_module("IPython.display").display  # every notebook has it
+        self._handle = display({"text/plain": ""}, raw=True, display_id=True)
+        self.refresh()
+
+    def update(self) -> None:
+        if time.perf_counter() - self._shown > 0.5:
+            self.refresh()
+
+    def refresh(self) -> None:
+        text = io.StringIO()
+        console = Console(file=text, width=100, force_jupyter=False, force_terminal=False)
+        console.print(self._draw())
+        self._handle.update({"text/plain": text.getvalue()}, raw=True)
+        self._shown = time.perf_counter()
+
+    def stop(self) -> None:
+        self._handle = None
+
+
 def sparkline(values: Sequence[float], low: float, high: float, levels: str = SPARKS) -> str:
     """Draw values as one line of characters.
 
@@ -237,17 +287,6 @@ def sparkline(values: Sequence[float], low: float, high: float, levels: str = SP
     means = np.array([group.mean() for group in groups])
     height = (means - low) / max(high - low, 1e-9)
     return "".join(levels[index] for index in np.rint(height * (len(levels) - 1)).astype(int))
-
-
-def _earlier_returns(run: Run) -> list[float]:
-    """Return the mean returns of the evaluations so far, if the run is resumed."""
-    try:
-        with (run.path / METRICS_FILE).open(newline="", encoding="utf-8") as file:
-            return [
-                float(row["eval/return"]) for row in csv.DictReader(file) if row.get("eval/return")
-            ]
-    except OSError:
-        return []
 
 
 def _clock(seconds: float) -> str:

@@ -8,7 +8,12 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from merl.training.loop import Progress
+from merl.config import TrainConfig
+from merl.training.loop import Progress, StepResult
+
+LONG = 2000
+"""Steps per environment without the end of an episode after which the user is warned; the limit is
+half of the run's steps if these are fewer."""
 
 
 class Averages:
@@ -115,3 +120,29 @@ class Interval:
         self._saved, self._within = self._now(), within
         if not within:
             self._episode_end = self._saved
+
+
+class EpisodeWatch:
+    """Watch whether episodes end, since metrics and evaluations wait for that.
+
+    Args:
+        config: the run's config.
+        step: the step from which on episodes begin.
+    """
+
+    def __init__(self, config: TrainConfig, step: int) -> None:
+        self._most = min(LONG * config.num_envs, max(1, config.steps // 2))
+        self._end: int | None = step  # of the last episode; None once the user is warned
+
+    def note(self, result: StepResult) -> str | None:
+        """Return, once, a warning if no episode has ended for a long time."""
+        if result.episodes:
+            self._end = result.step
+        elif self._end is not None and result.step - self._end > self._most:
+            self._end = None
+            return (
+                f"no episode has ended in {self._most:,} steps, and nothing is logged or evaluated "
+                "until one ends: if episodes have no end, wrap the environment in "
+                "gymnasium.wrappers.TimeLimit"
+            )
+        return None

@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import Any
 
 from merl.acting.environments import Environments, WorkerDied
+from merl.callbacks import Callback
 from merl.core import EnvironmentsLost
 from merl.core.guards import LossGuard
 from merl.replay import ReplayBuffer
@@ -15,7 +16,6 @@ from merl.runs import checkpoint
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.plain import to_plain
 from merl.runs.run import Run
-from merl.training.callbacks import Callback
 from merl.training.evaluator import Evaluations
 from merl.training.loop import Progress
 from merl.training.meters import Clock, Interval

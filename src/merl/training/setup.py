@@ -17,13 +17,14 @@ from gymnasium import spaces
 from merl.accelerate.networks import speed_up
 from merl.acting.env_checks import check_instances
 from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
+from merl.acting.workers import check_sendable
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
 from merl.agents.networks import make_networks, own_encoders
-from merl.config import TrainConfig
+from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import Agent, MerlError, counted, user_code
 from merl.core.resources import available_memory, keep_freed_memory
-from merl.envs.user_env import load_module
+from merl.envs.user_env import MakeEnv, load_module
 from merl.evaluation.video import MIN_SIDE
 from merl.replay import ReplaySpec, check_fits
 from merl.runs.resume import left_open
@@ -39,6 +40,7 @@ class Setup:
         config: the run's config, with fixed values of `device`, `threads`, and the agent's
             `precision`, `torch_compile` and `critic_high`.
         left_open: names of the fields that the given config left open.
+        make: makes the environment, if the config does not name it; else None.
         timing: time of a step and of an update on this machine.
         env: the environment for training.
         eval_env: the environment for evaluation; None without evaluations (`eval.every` is 0).
@@ -61,8 +63,9 @@ class Setup:
         eval_env: gymnasium.Env[Any, Any] | None,
         home: Path,
         replay_spec: ReplaySpec,
+        make: MakeEnv | None,
     ) -> None:
-        self.env, self.eval_env, self.home = env, eval_env, home
+        self.env, self.eval_env, self.home, self.make = env, eval_env, home, make
         self.replay_spec = replay_spec
         self.records_video = eval_env is not None and eval_env.render_mode == "rgb_array"
         self.spec = run_spec(config, env)
@@ -100,13 +103,22 @@ class Setup:
 
     @classmethod
     @contextmanager
-    def prepare(cls, config: TrainConfig, *, new: bool) -> Iterator[Setup]:
+    def prepare(
+        cls,
+        config: TrainConfig,
+        *,
+        new: bool,
+        source: Source = CUSTOM,
+        make: MakeEnv | None = None,
+    ) -> Iterator[Setup]:
         """Make environments and agent of a run, and check its config; write no files.
 
         Args:
             config: the config of the run.
             new: whether the run is new: its folder must not exist, its replay must fit, and the
                 modules of the user's environment and encoders may be in the working folder.
+            source: where the config's values come from; it names the folder of a new run.
+            make: makes the environment, if the config does not name it.
 
         Raises:
             MerlError: a device, a renderer, an observation or a folder is not available, or a size
@@ -121,13 +133,15 @@ class Setup:
             )
         home = Path.cwd()  # before user code runs, which may change the working folder
         if new:
-            refuse_existing(run_path(config, home))
-            if config.own_env and ":" in config.task:
+            refuse_existing(run_path(config, source, home))
+            if config.own_env and ":" in config.task and make is None:
                 load_module(config.task, home)
             for name in own_encoders(config.agent):
                 user_code.load_module(name, home, kind="encoder")
+        if config.has_workers:
+            check_sendable(config, make)
         with ExitStack() as stack:
-            env = make_run_env(config)
+            env = make_run_env(config, make)
             stack.callback(env.close)
             replay_spec = ReplaySpec.of(
                 config.replay,
@@ -136,19 +150,19 @@ class Setup:
                 rings=config.num_envs,
             )
             if new:
-                check_fits(replay_spec, run_path(config, home))
+                check_fits(replay_spec, run_path(config, source, home))
             eval_env = None
             if config.eval.every:
                 size = max(config.env.render_size, MIN_SIDE)
                 # Without videos, avoid the reset that tests whether a user's environment renders.
                 mode = None if config.own_env and config.eval.video == "none" else "rgb_array"
-                eval_env = make_run_env(config.evaluated, render_mode=mode, render_size=size)
+                eval_env = make_run_env(config.evaluated, make, render_mode=mode, render_size=size)
                 stack.callback(eval_env.close)
                 expected = EnvSpaces.of(config, env)
                 expected.check(EnvSpaces.of(config, eval_env), "the one for evaluations")
                 if config.own_env:
                     check_instances(env, eval_env)
-            yield cls(config, env, eval_env, home, replay_spec)
+            yield cls(config, env, eval_env, home, replay_spec, make)
 
 
 def bounded(agent: ObservationConfig, discount: float) -> ObservationConfig:

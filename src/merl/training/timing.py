@@ -1,7 +1,7 @@
 """Time an update and an environment step on this machine, once, before a run starts.
 
-Updates and acting are timed with synthetic observations. A user's own environment is timed only if
-`TrainConfig.measure` is set: it may be a robot, which must not move before the run starts.
+Updates and acting are timed with synthetic observations. A user's own environment is not timed: it
+may be a robot, which must not move before the run starts.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def measure(
 
     On a CPU, try the precisions on one thread, then the fastest on all threads. On a GPU, use all
     threads, and also try the fastest precision compiled. Do not reset, step or render a user's own
-    environments unless `config.measure` is set.
+    environments.
 
     Args:
         config: the config of the run.
@@ -171,12 +171,11 @@ def measure(
     torch.set_num_threads(threads)
     with torch_settings(device):
         step, frame = _time_acting(agent, batch, device), 0.0
-    knows_env = config.measure or not config.own_env
-    if knows_env:
+    if not config.own_env:
         makes_videos = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
         frame = _time_frame(eval_env) if makes_videos else 0.0
         step += _time_step(env)
-    timing = Timing(update, step, frame, knows_env=knows_env)
+    timing = Timing(update, step, frame, knows_env=not config.own_env)
     if not worth_compiling(config, timing, device):
         return timing
     print("merl: trying torch.compile once, which takes a minute or two", file=sys.stderr)

@@ -25,10 +25,10 @@ from merl.training.trainer import Trainer
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 FRONT = (ROOT / "README.md", ROOT / "CONTRIBUTING.md")
+OWN_AGENT = "small_agent:SmallAgent"
+"""The agent of docs/howto/agent.md; tests/agents/test_own_agent.py trains it and sets its flag."""
 FLAG = r"--(?:agent|env|eval|replay)\.[\w-]*\w"
 """A flag of a nested config, without the key that may follow (`--agent.encoders.wrist`)."""
-FILE = r"ave it as\s+`(\w+\.py)`:\n\n```python\n(.*?)```"
-"""The name and code of a file that a page asks to save."""
 PAGES = (*FRONT, *sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts))
 
 
@@ -81,21 +81,17 @@ def commands() -> Iterator[tuple[str, list[str]]]:
         text = page.read_text().replace("\\\n", " ").replace("$seed", "0")
         for line in re.findall(r"^(?:\$ | {4}(?:srun )?)merl (\w.*)", text, re.MULTILINE):
             words = takewhile(lambda word: word != "|", shlex.split(line, comments=True))
-            yield name_of(page), [word for word in words if word != "..."]
+            arguments = [word for word in words if word != "..."]
+            if OWN_AGENT not in arguments:
+                yield name_of(page), arguments
 
 
 def test_flags_of_the_config_exist(capsys: pytest.CaptureFixture[str]) -> None:
     for agent in ("merl", "sac"):
         with pytest.raises(SystemExit):
             main(["train", "--help", "--agent", agent])
-    known = set(re.findall(FLAG, capsys.readouterr().out))
-    named = set()
-    for page in PAGES:
-        text = page.read_text()
-        for flag in re.findall(FLAG, text):
-            field = flag.rpartition(".")[2].replace("-", "_")
-            if f"    {field}: " not in text:  # else a field of the page's own agent
-                named.add((name_of(page), flag))
+    known = {"--agent.hidden", *re.findall(FLAG, capsys.readouterr().out)}  # of `OWN_AGENT`
+    named = {(name_of(page), flag) for page in PAGES for flag in re.findall(FLAG, page.read_text())}
     assert len(known) > 50
     assert not [(page, flag) for page, flag in sorted(named) if flag not in known]
 
@@ -117,14 +113,7 @@ def test_commands_are_accepted(
         parse(*args, **options)
         raise AcceptedError
 
-    for file, code in re.findall(FILE, (ROOT / page).read_text(), re.DOTALL):
-        (tmp_path / file).write_text(code)
     monkeypatch.chdir(tmp_path)
-    if "small_agent:SmallAgent" in arguments:
-        (tmp_path / "small_agent.py").write_text(python_in("agent.md"))
-        monkeypatch.setattr(sys, "path", list(sys.path))
-        monkeypatch.setitem(sys.modules, "small_agent", None)
-        del sys.modules["small_agent"]
     monkeypatch.setattr(Trainer, "__init__", accept)
     monkeypatch.setattr(Run, "open", accept)
     if arguments[0] not in ("train", "resume", "evaluate"):
@@ -138,15 +127,10 @@ def test_commands_are_accepted(
 
 def python_of(page: str) -> dict[str, Any]:
     """Run the first block of Python of a how-to page; return its names."""
-    names: dict[str, Any] = {"__name__": "example"}
-    exec(compile(python_in(page), page, "exec"), names)
-    return names
-
-
-def python_in(page: str) -> str:
-    """Return the first block of Python of a how-to page."""
     (code, *_) = re.findall(r"```python\n(.*?)```", (DOCS / "howto" / page).read_text(), re.DOTALL)
-    return str(code)
+    names: dict[str, Any] = {"__name__": "example"}
+    exec(compile(code, page, "exec"), names)
+    return names
 
 
 def test_the_task_of_the_how_to_page_works(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -368,6 +368,12 @@ def test_a_timm_model_takes_its_weights_from_a_local_file(tmp_path: Path) -> Non
     assert isinstance(larger, TimmEncoder)
     with pytest.raises(MerlError, match="are of another model"):
         larger.load(file)
+    torch.save(larger.model.state_dict(), file)
+    with pytest.raises(MerlError, match="are of another model"):
+        one.load(file)
     file.write_bytes(b"no weights")
     with pytest.raises(MerlError, match="of encoder 'resnet18'"):
+        one.load(file)
+    file.unlink()
+    with pytest.raises(MerlError, match="there is no such file"):
         one.load(file)

@@ -86,16 +86,21 @@ class TimmEncoder(nn.Module):
         """
         from timm.models import load_state_dict
 
+        if not file.is_file():
+            raise MerlError(f"weights {file} of encoder {self._name!r}: there is no such file")
         try:
             weights = load_state_dict(str(file), device="cpu", weights_only=True)
             result = self.model.load_state_dict(weights, strict=False)
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
             raise MerlError(f"weights {file} of encoder {self._name!r}: {reason}") from None
-        if result.missing_keys:
+        classifier = self.model.pretrained_cfg.get("classifier") or ()
+        heads = (classifier,) if isinstance(classifier, str) else tuple(classifier)
+        others = [key for key in result.unexpected_keys if not key.startswith(heads)]
+        for key in (*result.missing_keys, *others):
             raise MerlError(
-                f"weights {file} are of another model: they lack {result.missing_keys[0]} of "
-                f"encoder {self._name!r}"
+                f"weights {file} are of another model than encoder {self._name!r}, which shows in "
+                f"{key}: use a file of the same model"
             )
 
     def forward(self, pixels: Tensor) -> Tensor:

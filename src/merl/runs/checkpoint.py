@@ -2,9 +2,8 @@
 
 `checkpoints/00010000/` holds `weights.safetensors` (the dicts of tensors in the agent's state),
 `learner.pt` (the rest of it, e.g. optimizers and random generators; read with `weights_only=True`),
-`state.json` (progress of the run) and
-`manifest.json` (sizes and SHA-256 of the other files). The folder is written under a temporary
-name, flushed to disk, then renamed.
+`state.json` (progress of the run) and `manifest.json` (sizes and SHA-256 of the other files). The
+folder is written under a temporary name, flushed to disk, then renamed.
 """
 
 from __future__ import annotations
@@ -32,12 +31,8 @@ from merl.core.guards import check_weights
 from merl.networks.settings import torch_settings
 
 FORMAT = 1
-_WEIGHTS, _LEARNER, _STATE, _MANIFEST = (
-    "weights.safetensors",
-    "learner.pt",
-    "state.json",
-    "manifest.json",
-)
+_WEIGHTS, _LEARNER = "weights.safetensors", "learner.pt"
+_STATE, _MANIFEST = "state.json", "manifest.json"
 _FILES = (_WEIGHTS, _LEARNER, _STATE)
 _BAD_VALUES = (ValueError, TypeError, AttributeError, RecursionError)
 _CPU = torch.device("cpu")

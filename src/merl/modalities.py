@@ -1,7 +1,8 @@
 """Modalities: what an observation key is, and how it is stored, stacked, augmented and scaled.
 
 To add a kind of observation, write a subclass of `Modality` here, add it to `MODALITIES`, and give
-it an encoder (`merl.networks.encoders`). Nothing else in merl asks what a key is.
+it an encoder (`merl.networks.encoders`); docs/howto/modality.md lists all files. Storage, sampling
+and acting ask the modality alone.
 """
 
 from __future__ import annotations
@@ -206,7 +207,7 @@ class Depth(Frames):
         return -(2**15), 2**15 - 1
 
     def to_stored(self, value: NDArray[Any]) -> NDArray[np.int16]:
-        """Quantise distances; the error is at most 1 / 131070 of the distance of the bounds."""
+        """Quantise distances; the error is about 1 / 131070 of the distance of the bounds at most."""
         nearest, farthest = float(self.space.low.min()), float(self.space.high.max())
         share = (value.clip(nearest, farthest) - nearest) / (farthest - nearest)
         return (np.rint(share * self.span) + self.bounds[0]).astype(np.int16)

@@ -207,7 +207,7 @@ class Depth(Frames):
         return -(2**15), 2**15 - 1
 
     def to_stored(self, value: NDArray[Any]) -> NDArray[np.int16]:
-        """Quantise distances; the error is about 1 / 131070 of the distance of the bounds at most."""
+        """Quantise distances, with an error of about 1 / 131070 of the bounds' distance."""
         nearest, farthest = float(self.space.low.min()), float(self.space.high.max())
         share = (value.clip(nearest, farthest) - nearest) / (farthest - nearest)
         return (np.rint(share * self.span) + self.bounds[0]).astype(np.int16)

@@ -30,6 +30,7 @@ class Modality(ABC):
     Attributes:
         space: the box of the key, in the form that agents use.
         kind: name of the kind.
+        plural: its plural, for people.
         encoder: name of its default encoder.
         stacked: whether it is a camera's frame: acting and sampling stack the last frames, updates
             shift them at random, and the replay can compress them.
@@ -37,6 +38,7 @@ class Modality(ABC):
 
     space: spaces.Box
     kind: ClassVar[Kind]
+    plural: ClassVar[str]
     encoder: ClassVar[str]
     stacked: ClassVar[bool] = False
 
@@ -141,7 +143,7 @@ class Frames(Modality):
 class Image(Frames):
     """A camera image, uint8 (H, W, C): grey, RGB, or RGBA."""
 
-    kind = "image"
+    kind, plural = "image", "images"
 
     @classmethod
     def fits(cls, space: spaces.Box) -> bool:
@@ -184,7 +186,7 @@ class Depth(Frames):
     values beyond them are clipped.
     """
 
-    kind = "depth"
+    kind, plural = "depth", "depth images"
 
     @classmethod
     def fits(cls, space: spaces.Box) -> bool:
@@ -221,7 +223,7 @@ class Depth(Frames):
 class Vector(Modality):
     """A vector of numbers, float32 (n,)."""
 
-    kind = "vector"
+    kind, plural = "vector", "vectors"
     encoder = "identity"
 
     @classmethod
@@ -245,7 +247,7 @@ class Sequence(Modality):
     sensor, which is faster than the control of the arm.
     """
 
-    kind = "sequence"
+    kind, plural = "sequence", "histories"
     encoder = "conv1d"
 
     @classmethod

@@ -13,7 +13,6 @@ from gymnasium.utils.env_checker import check_env
 from merl.core import MerlError
 from merl.envs import EnvConfig, make_env
 from merl.envs.registration import ENV_IDS, register
-from merl.envs.rendering import check_renderer
 from merl.tasks import TASKS
 
 ACTION = np.zeros(9, np.float32)
@@ -300,16 +299,9 @@ def test_defaults_of_the_settings():
     }
 
 
-def needs_opengl():
-    try:
-        check_renderer("gl")
-    except MerlError as error:
-        pytest.skip(f"no OpenGL library works on this machine: {error}")
-
-
+@pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize("task", TASKS)
 def test_both_renderers_see_the_same_distances(task):
-    needs_opengl()
     config = {"observations": ("depth",), "image_size": 64}
     with (
         closing(make_env(task, renderer="gl", **config)) as gl,

@@ -19,7 +19,7 @@ from merl.acting.generators import global_state, set_global_state
 from merl.agents.config import ObservationConfig
 from merl.agents.networks import observation_spec
 from merl.config import TrainConfig
-from merl.core import Kind, MerlError
+from merl.core import MerlError
 from merl.core.signals import handlers_kept
 from merl.envs import make_env
 from merl.envs.action_repeat import ActionRepeat
@@ -27,14 +27,6 @@ from merl.envs.config import OBSERVATION_KINDS, EnvConfig, ObservationKey
 from merl.envs.user_env import MakeEnv, make_user_env
 from merl.envs.user_spaces import brief
 from merl.modalities import ObservationSpec
-
-PLURALS: dict[Kind, str] = {
-    "image": "images",
-    "depth": "depth images",
-    "vector": "vectors",
-    "sequence": "histories",
-}
-"""Kinds of observations in the plural, for people."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -203,7 +195,7 @@ def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
     spec = run_spec(config, env)
     groups: dict[str, list[str]] = {}
     for key, modality in spec.modalities.items():
-        group = f"{PLURALS[modality.kind]} used"
+        group = f"{modality.plural} used"
         if key in spec.privileged:
             group += " by the critic alone"
         groups.setdefault(group, []).append(f"{key} ({modality.describe()})")
@@ -213,12 +205,11 @@ def key_lines(config: TrainConfig, env: gymnasium.Env[Any, Any]) -> list[str]:
         for key, given in env.get_wrapper_attr("keys").items():
             if key in spec.modalities:
                 continue
-            kind = given.modality.kind
             left_out[key] = "--agent.keys names others"
             if config.agent.keys is None:
                 left_out[key] = (
-                    f"agent {config.agent_name} uses no {PLURALS[kind]}, --agent.modalities {kind} "
-                    "adds them"
+                    f"agent {config.agent_name} uses no {given.modality.plural}, "
+                    f"--agent.modalities {given.modality.kind} adds them"
                 )
         left_out |= env.get_wrapper_attr("left_out")
     if left_out:

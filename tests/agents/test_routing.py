@@ -163,3 +163,14 @@ def test_each_weight_is_in_exactly_one_optimizer() -> None:
     trained = [id(p) for group in groups for p in group]
     assert sorted(trained) == sorted(id(p) for p in agent.networks.parameters())
     assert len(set(trained)) == len(trained)
+
+
+@pytest.mark.parametrize("frozen", ["image", "proprio"])
+def test_frozen_encoders_are_not_trained(frozen: str) -> None:
+    agent = replace(CASE, config=replace(CONFIG, frozen_encoders=(frozen,))).agent()
+    before = {name: p.detach().clone() for name, p in agent.networks.named_parameters()}
+    for seed in range(2):
+        agent.update(CASE.batch_of(seed), step=0)
+    for name, parameter in agent.networks.named_parameters():
+        is_frozen = name.startswith(f"encoders.by_key.{frozen}.")
+        assert torch.equal(parameter, before[name]) == is_frozen, name

@@ -22,7 +22,7 @@ from merl.envs import make_env
 from merl.envs.raster.renderer import RasterRenderer
 from merl.envs.rendering import make_renderer
 from merl.tasks import TASKS
-from merl.tasks.jaco import CAMERA
+from merl.tasks.arm_task import CAMERA
 
 SIZE = 84
 SIZES = ((84, 1), (84, 2), (48, 1), (48, 2), (32, 1), (32, 2), (24, 1), (24, 3), (480, 1))

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from merl.tasks import jaco, make_task
+from merl.tasks import arm_task, make_task
 
 
 class Episodes:
-    """A task, started as in `JacoEnv`: one physics for all episodes."""
+    """A task, started as in `ArmEnv`: one physics for all episodes."""
 
     def __init__(self, name, occluded=False, **form):
         self.name, self.occluded = name, occluded
@@ -28,21 +28,21 @@ def check_starts(episodes, seeds, resting_height):
     yaws, closures = [], []
     for seed in seeds:
         physics = episodes.start(seed)
-        hand, prop = task.tool_center_point(physics), task.prop_position(physics)
-        assert (hand >= np.array(jaco.HAND_SPAWN.lower) - 0.002).all()
-        assert (hand <= np.array(jaco.HAND_SPAWN.upper) + 0.002).all()
+        hand, prop = task.robot.tool_center_point(physics), task.prop_position(physics)
+        assert (hand >= np.array(arm_task.HAND_SPAWN.lower) - 0.002).all()
+        assert (hand <= np.array(arm_task.HAND_SPAWN.upper) + 0.002).all()
         assert (np.abs(prop[:2]) <= 0.101).all()
         assert abs(prop[2] - resting_height) < 1e-3
-        down = physics.bind(task.hand.tool_center_point).xmat.reshape(3, 3)[:, 2]
+        down = physics.bind(task.robot.hand.tool_center_point).xmat.reshape(3, 3)[:, 2]
         assert abs(down[2] + 1.0) < 0.01
-        robot = set(physics.bind(task.arm.mjcf_model.find_all("geom")).element_id)
+        robot = set(physics.bind(task.robot.arm.mjcf_model.find_all("geom")).element_id)
         for contact in physics.data.contact:
             pair = {contact.geom1, contact.geom2}
             assert not pair & robot or pair <= robot
         w, _, _, z = physics.data.qpos[-4:]
         yaws.append(2 * np.arctan2(z, w) % (2 * np.pi))
-        low, high = physics.bind(task.hand.joints).range.T
-        closures.append(((physics.bind(task.hand.joints).qpos - low) / (high - low)).mean())
+        low, high = physics.bind(task.robot.hand.joints).range.T
+        closures.append(((physics.bind(task.robot.hand.joints).qpos - low) / (high - low)).mean())
     return np.array(yaws), np.array(closures)
 
 

@@ -189,7 +189,7 @@ def test_evaluations_use_eval_start() -> None:
         try:
             env.reset(seed=0)
             inner: Any = env.unwrapped
-            heights[name] = inner.task.tool_center_point(inner.physics)[2]
+            heights[name] = inner.task.robot.tool_center_point(inner.physics)[2]
         finally:
             env.close()
     assert heights["trained"] < 0.15 < heights["evaluated"]

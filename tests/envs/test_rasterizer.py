@@ -8,7 +8,7 @@ from dm_control import mujoco as dm_mujoco
 from merl.envs import make_env
 from merl.envs.raster.renderer import RasterRenderer
 from merl.tasks import TASKS
-from merl.tasks.jaco import CAMERA
+from merl.tasks.arm_task import CAMERA
 
 
 @pytest.fixture(params=TASKS)

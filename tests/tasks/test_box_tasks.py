@@ -7,7 +7,7 @@ from dm_control import composer
 from episodes import Episodes, check_starts, check_uniform
 from merl.core import MerlError
 from merl.envs.raster.renderer import RasterRenderer
-from merl.tasks import BOX_TASKS, TASKS, jaco, make_task, rewards
+from merl.tasks import BOX_TASKS, TASKS, arm_task, make_task, rewards
 from merl.tasks.box import AROUND_BOX, BOX_HALF_SIZE, BOX_MASS
 from merl.tasks.expert import GRIP, Expert
 from merl.tasks.kinematics import Pose
@@ -29,7 +29,7 @@ class Segmentation:
     """A counter of the pixels of geoms in the image of the tasks' camera."""
 
     def __init__(self, physics, size):
-        self._renderer = RasterRenderer(physics, jaco.CAMERA.name, size)
+        self._renderer = RasterRenderer(physics, arm_task.CAMERA.name, size)
 
     def pixels(self, geom):
         return int((self._renderer.render_segmentation() == geom).sum())
@@ -86,7 +86,7 @@ def test_box_target_and_state(episodes):
     assert state.shape == (58,)
     np.testing.assert_allclose(state[42:45], task.prop_position(physics), atol=1e-6)
     np.testing.assert_array_equal(state[-3:], np.float32(target))
-    np.testing.assert_array_equal(state[:42], task.proprio(physics, "full"))
+    np.testing.assert_array_equal(state[:42], task.robot.proprio(physics, "full"))
     relative = task.state(physics, "relative")
     np.testing.assert_array_equal(relative[:58], state)
     np.testing.assert_allclose(state[30:33] + relative[58:61], state[42:45], atol=1e-6)
@@ -103,7 +103,7 @@ def test_success_and_rewards_depend_on_the_distances(episodes):
         assert task.success(physics) == (task.distance(physics) <= 0.01)
     for distance in draw.uniform(0.0, 0.15, 200):
         direction = draw.normal(size=3)
-        hand = task.tool_center_point(physics)
+        hand = task.robot.tool_center_point(physics)
         put_box(episodes, hand + distance * direction / np.linalg.norm(direction))
         assert task.hand_distance(physics) == pytest.approx(distance, abs=1e-9)
         terms = task.reward_terms(physics)
@@ -126,7 +126,7 @@ def test_staged_reward_pays_most_within_one_centimetre_of_the_target(name):
         physics.forward()
         return task.reward_terms(physics)
 
-    hand = task.tool_center_point(physics)
+    hand = task.robot.tool_center_point(physics)
     for offset, success in ((0.01, 1.0), (0.02, 0.1)):
         task.target = hand + np.array([0.0, 0.0, offset])
         paid = terms(hand)
@@ -214,10 +214,10 @@ def test_the_hand_can_start_around_the_box_without_contact(name):
         physics = episodes.start(seed)
         prop = task.prop_position(physics)
         np.testing.assert_array_equal(prop, above.task.prop_position(above.start(seed)))
-        offsets.append(task.tool_center_point(physics) - prop)
+        offsets.append(task.robot.tool_center_point(physics) - prop)
         velocities.append(np.abs(physics.data.qvel).max())
-        assert task.tilt_cosine(physics) > 0.99
-        robot = set(physics.bind(task.arm.mjcf_model.find_all("geom")).element_id)
+        assert task.robot.tilt_cosine(physics) > 0.99
+        robot = set(physics.bind(task.robot.arm.mjcf_model.find_all("geom")).element_id)
         for contact in physics.data.contact:
             pair = {contact.geom1, contact.geom2}
             assert contact.dist > 0 or not pair & robot or pair <= robot
@@ -258,7 +258,7 @@ def test_the_hand_can_start_carrying_the_box(name):
         shares.append(moved @ way / (way @ way))
         np.testing.assert_allclose(moved, shares[-1] * way, atol=2e-3)
         assert task.hand_distance(physics) < 0.03
-        assert task.tilt_cosine(physics) > 0.99
+        assert task.robot.tilt_cosine(physics) > 0.99
         control = np.zeros(physics.model.nu)
         control[-3:] = GRIP
         for _ in range(25):

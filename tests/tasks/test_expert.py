@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from episodes import Episodes
+from merl.tasks.arm_task import EPISODE_STEPS
 from merl.tasks.expert import Expert
-from merl.tasks.jaco import EPISODE_STEPS
 
 AT_BOX = {"starts": ("around", "holding", "carrying")}
 TASKS = [

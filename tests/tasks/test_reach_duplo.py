@@ -57,11 +57,11 @@ def test_motion_and_proprioception_equal_those_of_dm_control(ours, theirs):
         expected += [timestep.observation["duplo2x4/" + key].ravel() for key in prop]
         state = ours.task.state(physics)
         np.testing.assert_allclose(state, np.concatenate(expected), rtol=1e-6, atol=1e-7)
-        np.testing.assert_array_equal(ours.task.proprio(physics, "full"), state[:42])
-        np.testing.assert_array_equal(ours.task.proprio(physics), state[:24])
+        np.testing.assert_array_equal(ours.task.robot.proprio(physics, "full"), state[:42])
+        np.testing.assert_array_equal(ours.task.robot.proprio(physics), state[:24])
         relative = ours.task.state(physics, "relative")
         np.testing.assert_array_equal(relative[:55], state)
-        way = ours.task.prop_position(physics) - ours.task.tool_center_point(physics)
+        way = ours.task.prop_position(physics) - ours.task.robot.tool_center_point(physics)
         np.testing.assert_array_equal(relative[55:], np.float32(way))
         action = noise.uniform(spec.minimum, spec.maximum)
         timestep = environment.step(action)
@@ -80,7 +80,7 @@ def test_reward_equals_that_of_dm_control_at_every_distance(ours, theirs):
         direction = draw.normal(size=3)
         offset = distance * direction / np.linalg.norm(direction)
         for simulation in (physics, reference):  # the brick's free joint is the last
-            simulation.data.qpos[-7:-4] = ours.task.tool_center_point(physics) + offset
+            simulation.data.qpos[-7:-4] = ours.task.robot.tool_center_point(physics) + offset
             simulation.forward()
         reward = ours.task.get_reward(physics)
         assert reward == pytest.approx(environment.task.get_reward(reference), abs=1e-9)

@@ -16,9 +16,9 @@ from rich.table import Table
 from merl.bench.measuring import circumstances, seconds, shown, spread
 from merl.core import MerlError
 from merl.envs import make_env
-from merl.envs.jaco_env import JacoEnv
+from merl.envs.arm_env import ArmEnv
 from merl.envs.rendering import check_renderer, make_renderer
-from merl.tasks.jaco import CAMERA
+from merl.tasks.arm_task import CAMERA
 
 OURS, BARE, BLIND, THEIRS = (
     "merl, raster",
@@ -121,7 +121,7 @@ def _ours(**config: Any) -> tuple[Step, Step, Step]:
 def _bare(size: int) -> tuple[Step, Step, Step]:
     """Return reset, step and close of physics and image alone, without the rest of a step."""
     env = make_env("reach_duplo", observations=("proprio",))
-    assert isinstance(env, JacoEnv)
+    assert isinstance(env, ArmEnv)
     env.reset(seed=0)
     physics, noise = env.physics, np.random.default_rng(0)
     renderer = make_renderer("raster", physics, CAMERA.name, size)

@@ -12,12 +12,12 @@ from merl.core import MerlError, suggest
 from merl.envs.config import EnvConfig
 
 if TYPE_CHECKING:
-    from merl.envs.jaco_env import JacoEnv
+    from merl.envs.arm_env import ArmEnv
 
 __all__ = ["EnvConfig", "make_env"]
 
 
-def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> JacoEnv:
+def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> ArmEnv:
     """Make the environment of a task.
 
     Args:
@@ -26,7 +26,7 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
         **config: the fields of `EnvConfig`: `renderer`, `image_size`, `occluded`, ...
 
     Returns:
-        The environment, not yet reset; see `merl.envs.jaco_env.JacoEnv`.
+        The environment, not yet reset; see `merl.envs.arm_env.ArmEnv`.
 
     Raises:
         MerlError: the task or a setting is unknown, the renderer does not work on this machine, or
@@ -37,7 +37,7 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
         if name not in known:
             raise MerlError(f"make_env has no setting {name!r}: {suggest(name, known)}")
     settings = EnvConfig(**config)
-    from merl.envs.jaco_env import JacoEnv
+    from merl.envs.arm_env import ArmEnv
     from merl.tasks import make_task
 
     scene = make_task(
@@ -46,4 +46,4 @@ def make_env(task: str, *, render_mode: str | None = None, **config: Any) -> Jac
         starts=settings.start,
         reward=settings.reward,
     )
-    return JacoEnv(scene, settings, render_mode)
+    return ArmEnv(scene, settings, render_mode)

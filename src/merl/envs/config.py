@@ -16,10 +16,12 @@ AUTO_RENDERER: RendererName = "raster"
 were measured (docs/explanation/benchmarks.md). It does not depend on the machine, so the same code
 gives the same images everywhere."""
 ImageLayout = Literal["auto", "hwc", "chw"]
-ObservationKey = Literal["image", "depth", "proprio", "touch", "state"]
+ObservationKey = Literal["image", "depth", "wrist", "wrist_depth", "proprio", "touch", "state"]
 OBSERVATION_KINDS: dict[ObservationKey, Kind] = {
     "image": "image",
     "depth": "depth",
+    "wrist": "image",
+    "wrist_depth": "depth",
     "proprio": "vector",
     "touch": "vector",
     "state": "vector",
@@ -58,9 +60,9 @@ class EnvConfig:
     target) or `relative` (also the vectors from hand to object and from object to target)."""
 
     observations: Annotated[tuple[ObservationKey, ...], NOT_EMPTY] = ("image", "proprio")
-    """Keys of an observation: any of `image`, `depth` (of the same camera, m), `proprio`, `touch`
-    (forces on the palm and the six links of the fingers) and `state`. Other keys are not
-    computed."""
+    """Keys of an observation: any of `image` and `depth` (m) of the camera in front of the arm,
+    `wrist` and `wrist_depth` of a camera at the wrist, `proprio`, `touch` (forces on the palm and
+    the six links of the fingers) and `state`. Other keys are not computed."""
 
     occluded: bool = False
     """Put a disc between the camera and the object, for `move_box` and `lift_box`. Where the camera

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.envs.jaco_env import JacoEnv
+from merl.envs.arm_env import ArmEnv
 from merl.tasks.expert import Expert
 
 
@@ -19,20 +19,20 @@ class ExpertPolicy:
     Call `reset()` before every episode, then call the policy with each observation.
 
     Args:
-        env: a `JacoEnv`, wrapped or not; wrappers must not change the actions.
+        env: an `ArmEnv`, wrapped or not; wrappers must not change the actions.
 
     Raises:
-        MerlError: the environment is not a `JacoEnv`.
+        MerlError: the environment is not an `ArmEnv`, or its task has no expert.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        jaco = env.unwrapped
-        if not isinstance(jaco, JacoEnv):
+        arm_env = env.unwrapped
+        if not isinstance(arm_env, ArmEnv):
             raise MerlError(
-                f"there is no expert for {jaco}: experts only solve the tasks of merl.tasks"
+                f"there is no expert for {arm_env}: experts only solve the tasks of merl.tasks"
             )
-        self._env = jaco
-        self._expert = Expert(jaco.task, jaco.physics)
+        self._env = arm_env
+        self._expert = Expert(arm_env.task, arm_env.physics)
         self._fresh = True
 
     def reset(self) -> None:

@@ -9,8 +9,8 @@ from merl.core.choices import HandStart, RewardForm
 from merl.tasks.simulator import check_versions  # first: it loads MuJoCo without OpenGL
 
 # isort: split
+from merl.tasks.arm_task import ArmTask
 from merl.tasks.box import ABOVE, BoxTask
-from merl.tasks.jaco import JacoTask
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
@@ -18,7 +18,7 @@ from merl.tasks.reach_duplo import ReachDuplo
 __all__ = [
     "BOX_TASKS",
     "TASKS",
-    "JacoTask",
+    "ArmTask",
     "LiftBox",
     "MoveBox",
     "ReachDuplo",
@@ -29,7 +29,7 @@ __all__ = [
 BOX_TASKS: dict[str, type[BoxTask]] = {"move_box": MoveBox, "lift_box": LiftBox}
 """Tasks with a box, by name. They can be occluded, and support every `HandStart`."""
 
-TASKS: dict[str, Callable[[], JacoTask]] = {"reach_duplo": ReachDuplo, **BOX_TASKS}
+TASKS: dict[str, Callable[[], ArmTask]] = {"reach_duplo": ReachDuplo, **BOX_TASKS}
 """All tasks, by name."""
 
 
@@ -39,7 +39,7 @@ def make_task(
     occluded: bool = False,
     starts: tuple[HandStart, ...] = ABOVE,
     reward: RewardForm = "paper",
-) -> JacoTask:
+) -> ArmTask:
     """Make a task by its name.
 
     Args:

@@ -6,15 +6,12 @@ from contextlib import suppress
 
 import numpy as np
 from dm_control import composer, mjcf
-from dm_control.composer import initializers
-from dm_control.composer.variation import distributions
 from dm_control.entities import props
-from dm_control.manipulation.shared import workspaces
 
 from merl.core.choices import HandStart, RewardForm
-from merl.tasks.jaco import Box, JacoTask, Position
+from merl.tasks.arm_task import ArmTask, Box
 from merl.tasks.rewards import SUCCESS_DISTANCE
-from merl.tasks.simulator import quiet_inverse_kinematics
+from merl.tasks.robots import Position
 
 BOX_HALF_SIZE = 0.025
 """Half of the edge length, m. The centre of a box on the floor is at the same height."""
@@ -36,15 +33,15 @@ CLOSING_VELOCITY = 1.0
 CLOSING_STEPS = 20
 """Number of control steps in which the fingers close; enough for the widest start."""
 ABOVE: tuple[HandStart, ...] = ("above",)
-"""The start in dm_control, and the only one of a plain `JacoTask`."""
+"""The start in dm_control, and the only one of a plain `ArmTask`."""
 _RED = (1.0, 0.0, 0.0, 1.0)
 _GREY = (0.5, 0.5, 0.5, 1.0)
 
 
-class BoxTask(JacoTask):
+class BoxTask(ArmTask):
     """A task with a red cube that can be occluded, and at which the hand can start.
 
-    The start `above` is the start of `JacoTask`. For `around`, the hand is then moved to the box:
+    The start `above` is the start of `ArmTask`. For `around`, the hand is then moved to the box:
     to a position drawn from `AROUND_BOX`, with the fingers closed by a fraction drawn from
     `CLOSED_AROUND_BOX`, where it touches nothing. If no such position is found, which is rare, the
     hand stays above. For `holding`, the fingers then close around the box, which is on the floor.
@@ -95,7 +92,7 @@ class BoxTask(JacoTask):
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
-        """Start as `JacoTask` does, then move the hand to the box if the start requires it."""
+        """Start as `ArmTask` does, then move the hand to the box if the start requires it."""
         super().initialize_episode(physics, random_state)
         if self._starts == ABOVE:  # draw the same random numbers as dm_control
             return
@@ -118,18 +115,13 @@ class BoxTask(JacoTask):
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> bool:
         """Move the hand to the box; return whether a position without contact was found."""
-        joints = physics.bind([*self.arm.joints, *self.hand.joints])
+        joints = physics.bind([*self.robot.arm.joints, *self.robot.hand.joints])
         above, prop = np.array(joints.qpos), np.array(physics.bind(self._prop_frame).xpos)
-        place_hand = initializers.ToolCenterPointInitializer(
-            self.hand,
-            self.arm,
-            position=distributions.Uniform(*(np.array(AROUND_BOX) + prop)),
-            quaternion=workspaces.DOWN_QUATERNION,
-        )
+        lower, upper = np.array(AROUND_BOX) + prop
         for _ in range(ATTEMPTS):
-            self.hand.set_grasp(physics, random_state.uniform(*CLOSED_AROUND_BOX))
-            with suppress(composer.EpisodeInitializationError), quiet_inverse_kinematics():
-                place_hand(physics, random_state)
+            self.robot.hand.set_grasp(physics, random_state.uniform(*CLOSED_AROUND_BOX))
+            with suppress(composer.EpisodeInitializationError):
+                self.robot.place_hand(physics, random_state, lower, upper)
                 if not self._hand_touches_box(physics):
                     return True
         joints.qpos = above
@@ -137,7 +129,7 @@ class BoxTask(JacoTask):
 
     def _close_fingers(self, physics: mjcf.Physics, *, box_is_fixed: bool) -> None:
         velocities = np.zeros(physics.model.nu)
-        velocities[-len(self.hand.joints) :] = CLOSING_VELOCITY
+        velocities[-len(self.robot.hand.joints) :] = CLOSING_VELOCITY
         physics.set_control(velocities)
         box = physics.bind(self._prop_frame.freejoint)
         pose = np.array(box.qpos)

@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from dm_control import mjcf
 
+from merl.core import MerlError
+from merl.tasks.arm_task import ArmTask
 from merl.tasks.grasping import OPEN, TILTS, find_approach, find_carry
-from merl.tasks.jaco import JacoTask
 from merl.tasks.kinematics import Array, Kinematics, Path, Pose
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
@@ -67,13 +68,22 @@ class Expert:
     Args:
         task: the task to solve.
         physics: the simulation of the task; the expert only reads it.
+
+    Raises:
+        MerlError: the task has no expert.
     """
 
-    def __init__(self, task: JacoTask, physics: mjcf.Physics) -> None:
+    def __init__(self, task: ArmTask, physics: mjcf.Physics) -> None:
+        if type(task) not in PLANS:
+            raise MerlError(f"task {type(task).__name__} has no scripted expert")
         self.task, self.physics = task, physics
         self.arm = Kinematics(task, physics)
         self._low, self._high = physics.model.actuator_ctrlrange.T.copy()
-        self._joints, self._fingers = physics.bind(task.arm.joints), physics.bind(task.hand.joints)
+        robot = task.robot
+        self._joints, self._fingers = (
+            physics.bind(robot.arm.joints),
+            physics.bind(robot.hand.joints),
+        )
         self._actions: Actions = iter(())
 
     def reset(self) -> None:
@@ -208,7 +218,7 @@ class Expert:
         return FINGER_GAIN * (angles - self.fingers)
 
 
-PLANS: dict[type[JacoTask], Callable[[Expert], Actions]] = {
+PLANS: dict[type[ArmTask], Callable[[Expert], Actions]] = {
     ReachDuplo: Expert.reach,
     MoveBox: Expert.move,
     LiftBox: Expert.lift,

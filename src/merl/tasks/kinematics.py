@@ -15,7 +15,7 @@ import numpy as np
 from dm_control import mjcf
 from numpy.typing import NDArray
 
-from merl.tasks.jaco import CONTROL_TIMESTEP, JacoTask
+from merl.tasks.arm_task import CONTROL_TIMESTEP, ArmTask
 
 Array = NDArray[np.float64]
 Path = list[Array]
@@ -94,18 +94,18 @@ class Kinematics:
         max_velocity: maximum velocities of the arm's joints, (6,), rad/s.
     """
 
-    def __init__(self, task: JacoTask, physics: mjcf.Physics) -> None:
+    def __init__(self, task: ArmTask, physics: mjcf.Physics) -> None:
         model: Any = copy.copy(physics.model.ptr)
         model.geom_margin[:] = CLEARANCE
         model.geom_margin[model.geom_bodyid == 0] = HELD_CLEARANCE
         self._model, self._data = model, mujoco.MjData(model)
-        joints = physics.bind(task.arm.joints).element_id
-        fingers = physics.bind(task.hand.joints).element_id
+        joints = physics.bind(task.robot.arm.joints).element_id
+        fingers = physics.bind(task.robot.hand.joints).element_id
         self._qpos, self._dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._finger_qpos = model.jnt_qposadr[fingers]
         self._prop_qpos = slice(model.nq - 7, None)  # the object's free joint is the last
         self._resting: Array = model.qpos0[self._prop_qpos].copy()  # pose of the object, see `load`
-        self._site = int(physics.bind(task.hand.tool_center_point).element_id)
+        self._site = int(physics.bind(task.robot.hand.tool_center_point).element_id)
         self._turns_freely = ~model.jnt_limited[joints].astype(bool)
         unlimited = [[-np.inf], [np.inf]]
         self._low, self._high = np.where(self._turns_freely, unlimited, model.jnt_range[joints].T)
@@ -113,7 +113,7 @@ class Kinematics:
         self._is_floor = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self._is_scene = (model.geom_bodyid == 0) & ~self._is_floor
         self._is_robot, self._is_prop = np.zeros((2, model.ngeom), dtype=bool)
-        self._is_robot[physics.bind(task.arm.mjcf_model.find_all("geom")).element_id] = True
+        self._is_robot[physics.bind(task.robot.arm.mjcf_model.find_all("geom")).element_id] = True
         self._is_prop[physics.bind(task.prop.mjcf_model.find_all("geom")).element_id] = True
 
     def load(self, physics: mjcf.Physics, fingers: Array) -> None:

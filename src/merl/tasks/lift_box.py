@@ -34,7 +34,7 @@ class LiftBox(BoxTask):
         assert self.target is not None
         return rewards.lift(
             self.hand_distance(physics),
-            self.tilt_cosine(physics),
+            self.robot.tilt_cosine(physics),
             height=float(self.prop_position(physics)[2]),
             target_height=float(self.target[2]),
             goal_distance=self.goal_distance(physics),

@@ -6,10 +6,10 @@ from dm_control import mjcf
 from dm_control.entities import props
 
 from merl.tasks import rewards
-from merl.tasks.jaco import JacoTask
+from merl.tasks.arm_task import ArmTask
 
 
-class ReachDuplo(JacoTask):
+class ReachDuplo(ArmTask):
     """Bring the hand to within 5 cm of a 2x4 Duplo brick (dm_control's `reach_duplo`)."""
 
     term_names = ("reaching",)

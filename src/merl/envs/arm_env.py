@@ -10,27 +10,21 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.envs.config import DEPTH_RANGE, EnvConfig
+from merl.envs.config import DEPTH_RANGE, OBSERVATION_KINDS, EnvConfig, ObservationKey
 from merl.envs.rendering import Renderer, check_renderer, make_renderer
-from merl.tasks.jaco import (
-    CAMERA,
-    CONTROL_TIMESTEP,
-    EPISODE_STEPS,
-    PROPRIO_SIZES,
-    TOUCH_SIZE,
-    JacoTask,
-)
+from merl.tasks.arm_task import CAMERA, CONTROL_TIMESTEP, EPISODE_STEPS, ArmTask
 
 Observation = dict[str, Any]
+CAMERA_KEYS = {key for key, kind in OBSERVATION_KINDS.items() if kind in ("image", "depth")}
 
 
-class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """A Gymnasium environment for one task of the Jaco arm.
+class ArmEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """A Gymnasium environment for one task of a robot arm.
 
-    An observation is a dict with the keys in `EnvConfig.observations`: `image` uint8 (H, W, 3),
-    `depth` float32 (H, W, 1) in m, `proprio` float32 (24,) or (42,), `touch` float32 (7,), `state`
-    float32 (n,). An action is float32 (9,) in [-1, 1]:
-    the velocities of the arm's six joints and of the three fingers, as fractions of their maximum.
+    An observation is a dict with the keys in `EnvConfig.observations`: `image` and `wrist` uint8
+    (H, W, 3), `depth` and `wrist_depth` float32 (H, W, 1) in m, `proprio` float32 (24,) or (42,),
+    `touch` float32 (7,), `state` float32 (n,). An action is float32 (9,) in [-1, 1]: the velocities
+    of the arm's six joints and of the three fingers, as fractions of their maximum.
 
     An episode has 250 steps of 0.04 s and ends by truncation. After each step, `info` holds
     `success` (1.0 if the task is solved in the current state, else 0.0), `distance` (the distance
@@ -49,22 +43,23 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         "render_fps": round(1 / CONTROL_TIMESTEP),
     }
 
-    def __init__(self, task: JacoTask, config: EnvConfig, render_mode: str | None = None) -> None:
+    def __init__(self, task: ArmTask, config: EnvConfig, render_mode: str | None = None) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise MerlError(f"render_mode {render_mode!r} is unknown: give 'rgb_array' or None")
-        if render_mode or {"image", "depth"} & {*config.observations}:
+        keys = {*config.observations}
+        if render_mode or CAMERA_KEYS & keys:
             check_renderer(config.renderer)
         self.task, self.config, self.render_mode = task, config, render_mode
-        if "touch" in config.observations:
-            task.add_touch_sensors()
+        if "touch" in keys:
+            task.robot.add_touch_sensors()
+        self._wrist = task.robot.add_wrist_camera() if {"wrist", "wrist_depth"} & keys else ""
         self._physics: Any = self._compile()
-        self._renderers: dict[tuple[int, int], Renderer] = {}  # by size and samples
+        self._renderers: dict[tuple[str, int, int], Renderer] = {}  # by camera, size and samples
         self._steps_left = 0
         low, high = self._physics.model.actuator_ctrlrange.T
         self._action_center, self._action_scale = (high + low) / 2, (high - low) / 2
         self.action_space = spaces.Box(-1.0, 1.0, low.shape, np.float32)
-        state_size = self.task.state(self._physics, config.state).size
-        self.observation_space = _observation_space(config, state_size)
+        self.observation_space = spaces.Dict({key: self._space(key) for key in config.observations})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -119,7 +114,11 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         if self._physics is None:
             raise MerlError("the environment is closed: call reset() first")
-        return None if self.render_mode is None else self._image(self.config.render_size)
+        return (
+            None
+            if self.render_mode is None
+            else self._renderer(CAMERA.name, self.config.render_size, 1).render()
+        )
 
     def close(self) -> None:
         """Free renderers and physics until the next `reset()`; repeated calls have no effect."""
@@ -175,20 +174,36 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return velocities
 
     def _observe(self) -> Observation:
-        wanted = self.config.observations
-        observation: Observation = {}
-        if "image" in wanted:
-            observation["image"] = self._image(self.config.image_size, self.config.samples)
-        if "depth" in wanted:
-            renderer = self._renderer(self.config.image_size, 1)
-            observation["depth"] = renderer.render_depth().clip(*DEPTH_RANGE)[..., None]
-        if "touch" in wanted:
-            observation["touch"] = self.task.touch(self._physics)
-        if "proprio" in wanted:
-            observation["proprio"] = self.task.proprio(self._physics, self.config.proprio)
-        if "state" in wanted:
-            observation["state"] = self.task.state(self._physics, self.config.state)
-        return observation
+        return {key: self._read(key) for key in self.config.observations}
+
+    def _read(self, key: ObservationKey) -> NDArray[Any]:
+        """Return the current value of a key."""
+        robot, physics, config = self.task.robot, self._physics, self.config
+        match key:
+            case "image" | "wrist":
+                camera = self._wrist if key == "wrist" else CAMERA.name
+                return self._renderer(camera, config.image_size, config.samples).render()
+            case "depth" | "wrist_depth":
+                camera = self._wrist if key == "wrist_depth" else CAMERA.name
+                depth = self._renderer(camera, config.image_size, 1).render_depth()
+                return depth.clip(*DEPTH_RANGE)[..., None]
+            case "touch":
+                return robot.touch(physics)
+            case "proprio":
+                return robot.proprio(physics, config.proprio)
+            case "state":
+                return self.task.state(physics, config.state)
+
+    def _space(self, key: ObservationKey) -> spaces.Box:
+        size = self.config.image_size
+        match OBSERVATION_KINDS[key]:
+            case "image":
+                return spaces.Box(0, 255, (size, size, 3), np.uint8)
+            case "depth":
+                return spaces.Box(*DEPTH_RANGE, (size, size, 1), np.float32)
+            case _:
+                lowest = 0.0 if key == "touch" else -np.inf
+                return spaces.Box(lowest, np.inf, self._read(key).shape, np.float32)
 
     def _info(self, terms: dict[str, float]) -> dict[str, Any]:
         return {
@@ -197,26 +212,10 @@ class JacoEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "reward_terms": terms,
         }
 
-    def _image(self, size: int, samples: int = 1) -> NDArray[np.uint8]:
-        """Return an image of the scene, uint8 (size, size, 3)."""
-        return self._renderer(size, samples).render()
-
-    def _renderer(self, size: int, samples: int) -> Renderer:
-        if (size, samples) not in self._renderers:
-            renderer = make_renderer(
-                self.config.renderer, self._physics, CAMERA.name, size, samples
+    def _renderer(self, camera: str, size: int, samples: int) -> Renderer:
+        which = camera, size, samples
+        if which not in self._renderers:
+            self._renderers[which] = make_renderer(
+                self.config.renderer, self._physics, camera, size, samples
             )
-            self._renderers[size, samples] = renderer
-        return self._renderers[size, samples]
-
-
-def _observation_space(config: EnvConfig, state_size: int) -> spaces.Space[Observation]:
-    image_shape = (config.image_size, config.image_size, 3)
-    everything: dict[str, spaces.Space[Any]] = {
-        "image": spaces.Box(0, 255, image_shape, np.uint8),
-        "depth": spaces.Box(*DEPTH_RANGE, (*image_shape[:2], 1), np.float32),
-        "touch": spaces.Box(0.0, np.inf, (TOUCH_SIZE,), np.float32),
-        "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO_SIZES[config.proprio],), np.float32),
-        "state": spaces.Box(-np.inf, np.inf, (state_size,), np.float32),
-    }
-    return spaces.Dict({name: everything[name] for name in config.observations})
+        return self._renderers[which]

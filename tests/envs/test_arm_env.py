@@ -1,4 +1,4 @@
-"""`JacoEnv` and `make_env`: spaces, episodes, seeds, settings."""
+"""`ArmEnv` and `make_env`: spaces, episodes, seeds, settings."""
 
 import warnings
 from contextlib import closing
@@ -135,7 +135,7 @@ def test_info_has_success_distance_and_reward_terms(env_without_images):
     physics, task = env_without_images._physics, env_without_images.task
     for distance in (0.03, 0.07):
         env_without_images.reset(seed=0)
-        physics.data.qpos[-7:-4] = task.tool_center_point(physics) - (0.0, 0.0, distance)
+        physics.data.qpos[-7:-4] = task.robot.tool_center_point(physics) - (0.0, 0.0, distance)
         physics.forward()
         _, reward, _, _, info = env_without_images.step(ACTION)
         assert info["success"] == float(info["distance"] <= 0.05)
@@ -222,11 +222,11 @@ def test_keys_that_are_not_requested_are_not_computed(env_without_images, monkey
     def refuse(*_):
         raise AssertionError
 
-    monkeypatch.setattr(env_without_images, "_image", refuse)
+    monkeypatch.setattr(env_without_images, "_renderer", refuse)
     observation, _ = env_without_images.reset(seed=0)
     assert list(observation) == ["proprio", "state"]
     env = make_env("reach_duplo", renderer="raster", image_size=16, observations=("image",))
-    monkeypatch.setattr(env.task, "proprio", refuse)
+    monkeypatch.setattr(env.task.robot, "proprio", refuse)
     assert list(env.reset(seed=0)[0]) == ["image"]
     env.close()
 
@@ -300,9 +300,10 @@ def test_defaults_of_the_settings():
 
 
 @pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("key", ["depth", "wrist_depth"])
 @pytest.mark.parametrize("task", TASKS)
-def test_both_renderers_see_the_same_distances(task):
-    config = {"observations": ("depth",), "image_size": 64}
+def test_both_renderers_see_the_same_distances(task, key):
+    config = {"observations": (key,), "image_size": 64}
     with (
         closing(make_env(task, renderer="gl", **config)) as gl,
         closing(make_env(task, renderer="raster", **config)) as raster,
@@ -310,14 +311,15 @@ def test_both_renderers_see_the_same_distances(task):
         rng = np.random.default_rng(0)
         for step in range(30):
             if step % 10 == 0:
-                one, two = (env.reset(seed=step)[0]["depth"] for env in (gl, raster))
+                one, two = (env.reset(seed=step)[0][key] for env in (gl, raster))
             else:
                 action = rng.uniform(-1, 1, 9)
-                one, two = (env.step(action)[0]["depth"] for env in (gl, raster))
+                one, two = (env.step(action)[0][key] for env in (gl, raster))
             difference = np.abs(one - two)
             assert np.quantile(difference, 0.98) < 0.015  # m; more at silhouettes alone
-            assert 0.3 < one.min() < 1.0  # the hand or the arm
-            assert raster.observation_space["depth"].contains(two)
+            nearest = (0.3, 1.0) if key == "depth" else (0.01, 0.2)  # the hand or the arm
+            assert nearest[0] < one.min() < nearest[1]
+            assert raster.observation_space[key].contains(two)
 
 
 def test_depth_is_the_distance_along_the_cameras_axis():
@@ -364,9 +366,23 @@ def contact_forces(physics):
             yield force[0]
 
 
-def test_sensors_of_touch_do_not_change_the_simulation_or_the_images():
+def test_the_camera_at_the_wrist_moves_with_the_hand_and_sees_the_box():
+    config = {"observations": ("wrist", "wrist_depth", "image"), "start": ("around",)}
+    with closing(make_env("move_box", **config)) as env:
+        first, _ = env.reset(seed=0)
+        red = np.array(first["wrist"], int) @ [1, -1, -1] > 60
+        assert red.mean() > 0.01
+        assert 0.1 < np.median(first["wrist_depth"][red]) < 0.25  # m
+        for _ in range(10):
+            later, *_ = env.step(np.eye(9, dtype=np.float32)[0])
+        difference = np.abs(later["wrist"].astype(int) - first["wrist"]).mean()
+        assert difference > 5
+        assert np.abs(later["wrist"].astype(int) - later["image"]).mean() > 5
+
+
+def test_sensors_and_cameras_of_the_hand_do_not_change_the_simulation_or_the_images():
     plain = {"observations": ("image", "state"), "image_size": 32}
-    felt = {"observations": ("image", "touch", "state"), "image_size": 32}
+    felt = {"observations": ("image", "wrist", "touch", "state"), "image_size": 32}
     with (
         closing(make_env("move_box", **plain)) as one,
         closing(make_env("move_box", **felt)) as two,

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from merl.envs import make_env
-from merl.envs.config import RendererName
+from merl.rendering.config import RendererName
 from merl.tasks import BOX_TASKS, TASKS
 
 OUTPUT = Path(__file__).resolve().parent.parent / "docs/images/tasks.png"

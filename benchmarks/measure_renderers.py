@@ -19,8 +19,8 @@ import mujoco
 import numpy as np
 
 from merl.envs import make_env
-from merl.envs.raster.renderer import RasterRenderer
-from merl.envs.rendering import make_renderer
+from merl.rendering.raster.renderer import RasterRenderer
+from merl.rendering.renderer import make_renderer
 from merl.tasks import TASKS
 from merl.tasks.arm_task import CAMERA
 

@@ -89,12 +89,13 @@ def boxes_state() -> Iterator[tuple[str, str]]:
 def boxes_mixed() -> Iterator[tuple[str, str]]:
     """Yield runs whose starts mix three or all stages; their evaluations start above the box."""
     for agent, preset in (("merl_state", STATE), ("merl", LAPTOP)):
-        for stages in ("above around holding", "above around holding carrying"):
+        layers = 3 if agent == "merl_state" else 6
+        for stages in ("above around holding carrying", "above around holding"):
             for task in BOXES:
                 yield (
                     f"{task}-{agent}-{stages.split()[-1]}",
                     f"{task} {preset} --agent {agent} --reward staged --start {stages} "
-                    f"--eval.start above --agent.head-layers 6 --steps {BOX_STEPS}",
+                    f"--eval.start above --agent.head-layers {layers} --steps {BOX_STEPS}",
                 )
 
 

@@ -10,6 +10,9 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from merl.core import MerlError
+from merl.rendering.renderer import check_renderer
+
 # Environment of the processes that tests start: they share the cores with other tests, and their
 # output must not depend on the terminal.
 os.environ |= {"OMP_NUM_THREADS": "1", "COLUMNS": "80", "LINES": "25", "TERM": "xterm"}
@@ -42,6 +45,15 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def opengl() -> None:
+    """Skip a test on a machine without OpenGL."""
+    try:
+        check_renderer("gl")
+    except MerlError:
+        pytest.skip("no OpenGL library works on this machine")
 
 
 @pytest.fixture(autouse=True)

@@ -14,11 +14,11 @@ from typing import Any
 from merl.callbacks import Callback
 from merl.config import CUSTOM, Device, Setting, Source, TrainConfig, override
 from merl.core import MerlError
-from merl.envs.config import RendererName
 from merl.envs.user_env import MakeEnv, task_of
 from merl.evaluation.evaluation import Evaluation
 from merl.evaluation.policy import load_policy
 from merl.experiments.presets import compose, default_preset
+from merl.rendering.config import RendererName
 from merl.runs.resume import resume_request
 from merl.runs.run import Run
 from merl.training.live_view import LiveView

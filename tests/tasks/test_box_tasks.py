@@ -6,7 +6,7 @@ from dm_control import composer
 
 from episodes import Episodes, check_starts, check_uniform
 from merl.core import MerlError
-from merl.envs.raster.renderer import RasterRenderer
+from merl.rendering.raster.renderer import RasterRenderer
 from merl.tasks import BOX_TASKS, TASKS, arm_task, make_task, rewards
 from merl.tasks.box import AROUND_BOX, BOX_HALF_SIZE, BOX_MASS
 from merl.tasks.expert import GRIP, Expert

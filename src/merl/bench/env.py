@@ -17,7 +17,7 @@ from merl.bench.measuring import circumstances, seconds, shown, spread
 from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.arm_env import ArmEnv
-from merl.envs.rendering import check_renderer, make_renderer
+from merl.rendering.renderer import check_renderer, make_renderer
 from merl.tasks.arm_task import CAMERA
 
 OURS, BARE, BLIND, THEIRS = (

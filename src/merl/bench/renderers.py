@@ -7,7 +7,7 @@ from typing import get_args
 
 from merl.core import MerlError
 from merl.envs import make_env
-from merl.envs.config import RendererName
+from merl.rendering.config import RendererName
 
 FRAMES = 20
 

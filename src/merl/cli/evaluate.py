@@ -12,9 +12,9 @@ from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.core.fields import Range
-from merl.envs.config import RendererName
 from merl.evaluation.evaluation import EVALUATION_SEED
 from merl.evaluation.policy import load_policy
+from merl.rendering.config import RendererName
 from merl.report.references import references
 from merl.runs.run import Run
 from merl.training.live_view import describe

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError
 from merl.envs.config import DEPTH_RANGE, OBSERVATION_KINDS, EnvConfig, ObservationKey
-from merl.envs.rendering import Renderer, check_renderer, make_renderer
+from merl.rendering.renderer import Renderer, check_renderer, make_renderer
 from merl.tasks.arm_task import CAMERA, CONTROL_TIMESTEP, EPISODE_STEPS, ArmTask
 
 Observation = dict[str, Any]

@@ -6,15 +6,21 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from merl.core import Kind, MerlError
-from merl.core.choices import HandStart, ProprioSet, RewardForm, StateSet
+from merl.core.choices import (
+    HandStart,
+    ProprioSet,
+    RewardForm,
+    StateSet,
+)
 from merl.core.fields import NOT_EMPTY, Range, check_fields
+from merl.rendering.config import (
+    AUTO_RENDERER,
+    LARGEST_IMAGE,
+    RendererChoice,
+    Samples,
+    check_samples,
+)
 
-RendererName = Literal["gl", "raster"]
-RendererChoice = Literal["auto", "gl", "raster"]
-AUTO_RENDERER: RendererName = "raster"
-"""The renderer that replaces `auto`. It works on every machine, and is the faster one where both
-were measured (docs/explanation/benchmarks.md). It does not depend on the machine, so the same code
-gives the same images everywhere."""
 ImageLayout = Literal["auto", "hwc", "chw"]
 ObservationKey = Literal["image", "depth", "wrist", "wrist_depth", "proprio", "touch", "state"]
 OBSERVATION_KINDS: dict[ObservationKey, Kind] = {
@@ -29,9 +35,6 @@ OBSERVATION_KINDS: dict[ObservationKey, Kind] = {
 """Keys of an observation of merl's own tasks, with their kinds."""
 DEPTH_RANGE = (0.0, 2.0)
 """Bounds of `depth`, m; greater distances, such as those of the sky, are clipped."""
-Samples = Annotated[int, Range(1, 4)]
-LARGEST_IMAGE = 2048
-"""Most pixels along an edge of an image."""
 
 
 @dataclass(frozen=True)
@@ -91,20 +94,6 @@ class EnvConfig:
                 f"samples is {self.samples}, and renderer {self.renderer!r} takes one sample per "
                 "pixel: use renderer raster, or samples 1"
             )
-
-
-def check_samples(samples: int, size: int) -> None:
-    """Reject more samples along an edge of an image of `size` pixels than `LARGEST_IMAGE`.
-
-    Raises:
-        MerlError: naming the values and the bound.
-    """
-    if samples * size > LARGEST_IMAGE:
-        raise MerlError(
-            f"samples is {samples} at {size} pixels, which is {samples * size} samples along an "
-            f"edge of the image: at most {LARGEST_IMAGE} are possible, so use fewer samples or a "
-            "smaller image"
-        )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 MuJoCo and dm_control look for an OpenGL library when they are imported. They warn if there is none,
 and fail if `MUJOCO_GL` names a missing one. Physics needs no OpenGL, so this module imports both
 with OpenGL disabled, unless they are imported already. The OpenGL renderer enables OpenGL in
-dm_control later (`merl.envs.opengl`).
+dm_control later (`merl.rendering.opengl`).
 """
 
 from __future__ import annotations

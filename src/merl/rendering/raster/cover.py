@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from merl.envs.raster.structs import Surfaces, View
+from merl.rendering.raster.structs import Surfaces, View
 
 wp.set_module_options({"enable_backward": False})
 

@@ -6,7 +6,7 @@ import pytest
 from dm_control import mujoco as dm_mujoco
 
 from merl.envs import make_env
-from merl.envs.raster.renderer import RasterRenderer
+from merl.rendering.raster.renderer import RasterRenderer
 from merl.tasks import TASKS
 from merl.tasks.arm_task import CAMERA
 

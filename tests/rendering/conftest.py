@@ -7,9 +7,6 @@ import merl.tasks  # noqa: F401  (before dm_control, which then does not look fo
 # isort: split
 from dm_control import mujoco as dm_mujoco
 
-from merl.core import MerlError
-from merl.envs.rendering import check_renderer
-
 EVERY_GEOM = """
 <mujoco>
   <visual><map znear="0.05"/></visual>
@@ -41,14 +38,6 @@ EVERY_GEOM = """
   </worldbody>
 </mujoco>
 """
-
-
-@pytest.fixture(scope="module")
-def opengl():
-    try:
-        check_renderer("gl")
-    except MerlError:
-        pytest.skip("no OpenGL library works on this machine")
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.envs.config import RendererChoice
-from merl.envs.opengl import GlRenderer, enable_opengl
-from merl.envs.raster.renderer import RasterRenderer
+from merl.rendering.config import RendererChoice
+from merl.rendering.opengl import GlRenderer, enable_opengl
+from merl.rendering.raster.renderer import RasterRenderer
 
 
 class Renderer(Protocol):

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from dm_control import manipulation
 
-from merl.envs import make_env, warp_runtime
+from merl.envs import make_env
+from merl.rendering import warp_runtime
 
 
 @pytest.fixture(scope="module")
@@ -255,7 +256,7 @@ def test_waiting_for_a_busy_processor_prints_no_notice(capsys):
 
 
 def test_raster_works_without_a_home(tmp_path):
-    code = "from merl.envs import warp_runtime; warp_runtime.start_warp(); import warp;"
+    code = "from merl.rendering import warp_runtime; warp_runtime.start_warp(); import warp;"
     code += "print(warp.config.kernel_cache_dir)"
     home = tmp_path / "a file, so that no folder can be made in it"
     home.touch()

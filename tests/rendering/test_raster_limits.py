@@ -10,7 +10,7 @@ import pytest
 from dm_control import mujoco as dm_mujoco
 
 from merl.core import MerlError
-from merl.envs.raster.renderer import RasterRenderer
+from merl.rendering.raster.renderer import RasterRenderer
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.envs.raster.shapes import Shape, shape_of
-from merl.envs.raster.textures import Textures, pixels
+from merl.rendering.raster.shapes import Shape, shape_of
+from merl.rendering.raster.textures import Textures, pixels
 
 DRAWN_GROUPS = 3
 """Geoms in groups below this are drawn, as in MuJoCo by default."""

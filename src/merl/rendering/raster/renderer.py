@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError, suggest
 from merl.core.fields import Range, check_value
-from merl.envs.config import LARGEST_IMAGE, Samples, check_samples
-from merl.envs.raster.scene import Scene, build_scene
-from merl.envs.warp_runtime import compiling, start_warp
+from merl.rendering.config import LARGEST_IMAGE, Samples, check_samples
+from merl.rendering.raster.scene import Scene, build_scene
+from merl.rendering.warp_runtime import compiling, start_warp
 
 SHADOW_TEXELS = 1.5
 """Texels along an edge of a shadow map, per sample along an edge of the image."""
@@ -49,7 +49,7 @@ class RasterRenderer:
         check_value("size", size, Annotated[int, Range(1, LARGEST_IMAGE)])
         check_value("samples", samples, Samples)
         check_samples(samples, size)
-        self._wp, self._structs = start_warp(), import_module("merl.envs.raster.structs")
+        self._wp, self._structs = start_warp(), import_module("merl.rendering.raster.structs")
         self._model, self._data = physics.model.ptr, physics.data.ptr
         self._camera = _camera_of(self._model, camera)
         self._lock = threading.Lock()
@@ -177,7 +177,7 @@ class RasterRenderer:
         """Record every launch once; replaying a launch takes microseconds."""
         wp, a = self._wp, self._arrays
         covering, shading = (
-            import_module(f"merl.envs.raster.{name}") for name in ("cover", "shade")
+            import_module(f"merl.rendering.raster.{name}") for name in ("cover", "shade")
         )
         scene, surfaces, samples = self._scene, self._surfaces, self._samples
 

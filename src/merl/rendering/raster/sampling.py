@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from merl.envs.raster.cover import in_line
-from merl.envs.raster.structs import Level, Material, View
+from merl.rendering.raster.cover import in_line
+from merl.rendering.raster.structs import Level, Material, View
 
 wp.set_module_options({"enable_backward": False})
 

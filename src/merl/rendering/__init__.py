@@ -1,0 +1,1 @@
+"""Renderers of MuJoCo scenes: OpenGL, and a rasteriser on the processor or a GPU."""

@@ -208,7 +208,8 @@ def test_a_missing_extra_is_named_before_anything_is_written(
 
 def test_an_unknown_logger_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "reach_duplo", "--log", "tensorbord"]) == 2
-    assert "tensorbord" in capsys.readouterr().err
+    assert "tensorbord" in (message := capsys.readouterr().err)
+    assert "did you mean 'tensorboard'" in message
 
 
 class Unreliable(loggers.Logger):

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 Setting = Literal["matched", "published"]
 """Source of an agent's values: MERL and the preset, or the agent's authors."""
-LoggerName = Literal["tensorboard", "wandb", "trackio"]
 Video = Literal["each", "last", "none"]
 Device = Literal["auto", "cpu", "cuda"]
 Steps = Annotated[int, Range(1, 10**12)]
@@ -120,9 +119,9 @@ class TrainConfig:
     save_every: Annotated[float, Range(0)] = 300.0
     """Seconds between checkpoints; a checkpoint waits for the end of an episode, unless that takes
     much longer."""
-    log: tuple[LoggerName, ...] = ()
-    """Where to write the metrics, in addition to metrics.csv: tensorboard, wandb, trackio (each is
-    an extra of this package)."""
+    log: tuple[str, ...] = ()
+    """Loggers in addition to metrics.csv: tensorboard, wandb, trackio (each is an extra of this
+    package)."""
     keep: Steps = 2
     """Number of recent checkpoints to keep, in addition to the best one."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(

@@ -16,8 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from merl.callbacks import Callback
-from merl.config import LoggerName
-from merl.core import MerlError
+from merl.core import MerlError, check_choice
 from merl.core.user_code import reason
 from merl.evaluation.evaluation import Evaluation
 from merl.runs.metrics import MetricsFile, append_whole
@@ -222,20 +221,23 @@ class Trackio(WandB):
         return {"name": f"{run.path.name}-{run.public_id[:8]}"}  # the name is the only id
 
 
-_BY_NAME: dict[LoggerName, type[Logger]] = {
+LOGGERS: dict[str, type[Logger]] = {
     "tensorboard": TensorBoard,
     "wandb": WandB,
     "trackio": Trackio,
 }
+"""The loggers of `--log`, by name."""
 
 
-def make_loggers(names: Iterable[LoggerName]) -> list[Logger]:
+def make_loggers(names: Iterable[str]) -> list[Logger]:
     """Make the loggers of `TrainConfig.log`.
 
     Raises:
-        MerlError: an extra is not installed.
+        MerlError: a name is unknown, or an extra is not installed.
     """
-    return [_BY_NAME[name]() for name in dict.fromkeys(names)]
+    for name in names:
+        check_choice("log", name, tuple(LOGGERS))
+    return [LOGGERS[name]() for name in dict.fromkeys(names)]
 
 
 def _imported(module: str, extra: str) -> Any:

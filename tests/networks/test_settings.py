@@ -244,7 +244,7 @@ def test_loaded_policy_acts_on_one_thread_by_default(
     torch.set_num_threads(2)
     policy = merl.load_policy(runs[1], **threads)
     seen: list[int] = []
-    agent: Any = policy._agent
+    agent: Any = policy.agent
     agent.networks.actor.register_forward_hook(lambda *_: seen.append(torch.get_num_threads()))
     policy(DotEnv().reset(seed=0)[0])
     assert (seen, torch.get_num_threads()) == ([used], 2)

@@ -89,7 +89,7 @@ def arguments(run: Path, *options: str) -> list[str]:
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
-    return merl.load_policy(run)._agent.networks.state_dict()  # type: ignore[attr-defined]
+    return merl.load_policy(run).agent.networks.state_dict()  # type: ignore[attr-defined]
 
 
 def test_each_box_has_its_modality_and_form() -> None:

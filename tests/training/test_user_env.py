@@ -180,7 +180,7 @@ def test_a_run_prints_its_keys_and_resumes_with_them(
     record = json.loads((run / "config.json").read_text())
     assert record["observation_space"]["mask"]["bounds"] == [0, 1]
     policy = merl.load_policy(run)
-    encoder = policy._agent.networks.encoders.by_key["mask"]  # type: ignore[attr-defined]
+    encoder = policy.agent.networks.encoders.by_key["mask"]  # type: ignore[attr-defined]
     assert encoder.frames.bounds == (0, 1)
     agent = Run.open(run).config.agent
     assert agent.keys == ("joints", "mask")

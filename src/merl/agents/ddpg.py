@@ -107,9 +107,9 @@ class DDPG:
         Returns:
             Actions (B, A), in [-1, 1].
         """
-        mean: Tensor = self._policy(observation, averaged=not explore)
         if not explore:
-            return mean
+            return self.networks.forward(observation)
+        mean: Tensor = self.networks.policy(observation)
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
         correlation = self.config.noise_correlation
         if correlation:
@@ -296,12 +296,6 @@ class DDPG:
         self.networks.load_state_dict(weights["networks"])
 
     # ----------------------------------------------------------------------------------------
-
-    def _policy(self, observation: Mapping[str, Tensor], *, averaged: bool) -> Any:
-        """Return the actor's output; privileged keys may be missing in the observation."""
-        networks = self.networks
-        sensed = {key: observation[key] for key in networks.senses}
-        return networks.policy(networks.encoders(sensed), averaged=averaged)
 
     def _actors_fusion(self) -> Iterator[nn.Parameter]:
         """Yield the fusion weights that the actor's loss trains: its own, or the shared ones."""

@@ -64,21 +64,31 @@ class Networks(nn.Module):
         """Observation keys that the actor uses."""
         return self._fusion_of_actor().modalities
 
+    def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """Return the actions (B, A) without noise, in [-1, 1]: the policy that is deployed.
+
+        Args:
+            observation: the keys of `senses`, as in `Batch`; others are ignored.
+        """
+        action: Tensor = self.actor.best(self.policy(observation, averaged=True))
+        return action
+
+    def policy(self, observation: Mapping[str, Tensor], *, averaged: bool = False) -> Any:
+        """Compute the actor's output.
+
+        Args:
+            observation: as in `forward`.
+            averaged: use the averaged weights, if there are any.
+        """
+        encoded = self.encoders({key: observation[key] for key in self.senses})
+        if averaged and self.policy_average is not None:
+            return self.policy_average["actor"](self.policy_average["fusion"](encoded))
+        return self.actor(self.actor_latent(encoded))
+
     def actor_latent(self, encoded: Mapping[str, Tensor]) -> Tensor:
         """Fuse the encodings for the actor."""
         latent: Tensor = self._fusion_of_actor()(encoded)
         return latent
-
-    def policy(self, encoded: Mapping[str, Tensor], *, averaged: bool = False) -> Any:
-        """Compute the actor's output from the encodings.
-
-        Args:
-            encoded: {key: (B, F_key)}.
-            averaged: use the averaged weights, if there are any.
-        """
-        if averaged and self.policy_average is not None:
-            return self.policy_average["actor"](self.policy_average["fusion"](encoded))
-        return self.actor(self.actor_latent(encoded))
 
     def start_average(self) -> None:
         """Start the moving average of the actor and its fusion, as a copy of them."""

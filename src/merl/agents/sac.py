@@ -68,9 +68,9 @@ class SAC(DDPG):
     @torch.inference_mode()
     def act(self, observation: Mapping[str, Tensor], *, explore: bool, step: int) -> Tensor:
         """Return tanh(u), u ~ N(mu, sigma^2), to explore, else tanh(mu); see `DDPG.act`."""
-        mean, log_std = self._policy(observation, averaged=not explore)
         if not explore:
-            return torch.tanh(mean)
+            return self.networks.forward(observation)
+        mean, log_std = self.networks.policy(observation)
         noise = torch.randn(mean.shape, generator=self.acting, device=self.device)
         return torch.tanh(mean + log_std.exp() * noise)
 

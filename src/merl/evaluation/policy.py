@@ -37,6 +37,7 @@ class Policy:
     Call `reset()` at the start of each episode, then call the policy with each observation.
 
     Attributes:
+        agent: the agent; for merl's own, `agent.networks` is the policy as a torch module.
         config: the config of its run.
         step: environment steps at which the policy was saved.
         reports_success: whether the environment was known to report success at that step.
@@ -54,7 +55,7 @@ class Policy:
     ) -> None:
         self.config, self.step, self._run = config, step, run
         self.reports_success = reports_success
-        self._agent = agent
+        self.agent = agent
         known = modalities_of(space)
         modalities = {key: known[key] for key in agent.senses}
         self._keys = {key: UserKey.as_trained(key, m) for key, m in modalities.items()}
@@ -86,7 +87,7 @@ class Policy:
         else:
             self._stack.push(sensed)
         self._fresh = False
-        action = self._agent.act(self._stack.observation(), explore=False, step=self.step)[0]
+        action = self.agent.act(self._stack.observation(), explore=False, step=self.step)[0]
         result: NDArray[np.float32] = action.to("cpu", torch.float32).numpy()
         return result
 

@@ -84,6 +84,11 @@ class Actor(nn.Module):
         """Compute the mean action (B, A), in (-1, 1), from the latent (B, d)."""
         return torch.tanh(self.layers(latent))
 
+    @staticmethod
+    def best(mean: Tensor) -> Tensor:
+        """Return the action without noise for an output of `forward`: the mean."""
+        return mean
+
 
 class GaussianActor(nn.Module):
     """pi_theta of SAC: network from the latent to mean and log std of a Gaussian, before its tanh.
@@ -103,3 +108,8 @@ class GaussianActor(nn.Module):
         mean, raw = self.layers(latent).chunk(2, dim=-1)
         log_std = self.LEAST + (self.GREATEST - self.LEAST) * (torch.tanh(raw) + 1) / 2
         return mean, log_std
+
+    @staticmethod
+    def best(output: tuple[Tensor, Tensor]) -> Tensor:
+        """Return the action without noise for an output of `forward`: tanh(mu)."""
+        return torch.tanh(output[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -11,7 +12,7 @@ from dm_control.entities import props
 from merl.core.choices import HandStart, RewardForm
 from merl.tasks.arm_task import ArmTask, Box
 from merl.tasks.rewards import SUCCESS_DISTANCE
-from merl.tasks.robots import Position
+from merl.tasks.robots import Position, Robot, jaco
 
 BOX_HALF_SIZE = 0.025
 """Half of the edge length, m. The centre of a box on the floor is at the same height."""
@@ -53,6 +54,7 @@ class BoxTask(ArmTask):
         starts: where the hand starts; with several, each episode draws one. The disc of `occluded`
             leaves no space for the hand at the box.
         reward: form of the reward.
+        robot: makes the arm with its hand.
 
     Attributes:
         occluded, reward: the arguments.
@@ -71,10 +73,12 @@ class BoxTask(ArmTask):
         occluded: bool = False,
         starts: tuple[HandStart, ...] = ABOVE,
         reward: RewardForm = "paper",
+        robot: Callable[[], Robot] = jaco,
     ) -> None:
         size = [BOX_HALF_SIZE] * 3
         box = props.Primitive(geom_type="box", size=size, mass=BOX_MASS, rgba=_RED, name="box")
-        super().__init__(box, BOX_HALF_SIZE, self.place_over_disc if occluded else self.place)
+        target = self.place_over_disc if occluded else self.place
+        super().__init__(box, BOX_HALF_SIZE, target, robot)
         self.occluded, self.reward, self._starts = occluded, reward, starts
         if reward == "staged":
             self.term_names = (*self.term_names, "success")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from dm_control import mjcf
 from dm_control.entities import props
 
 from merl.tasks import rewards
 from merl.tasks.arm_task import ArmTask
+from merl.tasks.robots import Robot, jaco
 
 
 class ReachDuplo(ArmTask):
@@ -15,8 +18,8 @@ class ReachDuplo(ArmTask):
     term_names = ("reaching",)
     success_distance = rewards.REACHING_DISTANCE
 
-    def __init__(self) -> None:
-        super().__init__(prop=props.Duplo())
+    def __init__(self, robot: Callable[[], Robot] = jaco) -> None:
+        super().__init__(prop=props.Duplo(), robot=robot)
 
     def distance(self, physics: mjcf.Physics) -> float:
         """Return the distance from the tool centre point to the brick, m."""

@@ -1,3 +1,4 @@
+# make demo: set up and film a trained arm, demo.mp4.
 # make train: set up and train MERL on reach_duplo for about ten minutes.
 # make test: set up and pass the tests in their short form; make test-all runs the long forms too.
 # make docs: set up and build the documentation site, docs/_build/index.html.
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 MINUTES := 10
 PYTEST_FLAGS := --numprocesses 2 --dist worksteal --durations 10
 
-.PHONY: help setup train test test-all docs clean
+.PHONY: help setup demo train test test-all docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -22,6 +23,9 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV) || { echo "$(PYTHON) cannot make a virtual environment: install its venv module (Debian: apt-get install $(PYTHON)-venv)" >&2; exit 2; }
 	@bash install.sh $(BIN)/pip --constraint constraints.txt --editable '.[dev]'
 	@touch $@
+
+demo: setup
+	@$(BIN)/merl evaluate pretrained/reach_duplo --episodes 3 --video demo.mp4
 
 train: setup
 	@$(BIN)/merl train reach_duplo --preset laptop --minutes $(MINUTES)

@@ -33,7 +33,14 @@ from merl.runs.plain import from_plain
 from merl.runs.provenance import machine
 from merl.runs.record import FORMAT, Bounds
 from merl.runs.resume import REOPENED
-from merl.runs.run_folder import create_folder, discard_folder, lock_folder, refuse_existing
+from merl.runs.run_folder import (
+    PRETRAINED,
+    create_folder,
+    discard_folder,
+    existing_run,
+    lock_folder,
+    refuse_existing,
+)
 from merl.runs.trust import Origin
 
 
@@ -122,7 +129,7 @@ class Run:
         Raises:
             MerlError: the folder is not a run, or its config cannot be read.
         """
-        path = path.absolute()  # user code may change the working folder
+        path = existing_run(path)  # absolute, since user code may change the working folder
         with record.readable(path):
             recorded = record.read(path)
             config = record.config_of(recorded)
@@ -268,7 +275,16 @@ class Run:
         discard_folder(self.path, self.created)
 
     def lock(self) -> AbstractContextManager[None]:
-        """Lock the folder so that no other process trains in it; see `lock_folder`."""
+        """Lock the folder so that no other process trains in it; see `lock_folder`.
+
+        Raises:
+            MerlError: another process trains in it, or it is a policy that comes with merl.
+        """
+        if self.path.parent == PRETRAINED:
+            raise MerlError(
+                f"pretrained/{self.path.name} is a trained policy without what training needs: "
+                f"evaluate it, or train with `merl train {self.config.task}`"
+            )
         return lock_folder(self.path)
 
     @property

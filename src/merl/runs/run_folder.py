@@ -14,8 +14,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from merl.config import Source, TrainConfig
-from merl.core import CONFIG_FILE, METRICS_FILE, MerlError
+from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, suggest
 
+PRETRAINED = Path(__file__).parent.parent / "pretrained"
+"""Folder of the trained policies that come with merl: run folders without a replay."""
 LOCK_FILE = "lock"
 PART = f".{CONFIG_FILE}.part"
 """Temporary name of `config.json` while it is written."""
@@ -43,6 +45,20 @@ def run_path(config: TrainConfig, source: Source, home: Path | None = None) -> P
     runs = home / "runs"
     numbered = (runs / f"{name}-{number}" for number in itertools.count(2))
     return next(p for p in itertools.chain([runs / name], numbered) if not _exists(p))
+
+
+def existing_run(path: Path) -> Path:
+    """Return the absolute path of a run; `pretrained/NAME` is one that comes with merl.
+
+    Raises:
+        MerlError: there is no such policy in merl.
+    """
+    if path.parent != Path(PRETRAINED.name) or path.exists():
+        return path.absolute()
+    if not (PRETRAINED / path.name).is_dir():
+        known = sorted(each.name for each in PRETRAINED.iterdir() if each.is_dir())
+        raise MerlError(f"merl has no policy {str(path)!r}: {suggest(path.name, known)}")
+    return PRETRAINED / path.name
 
 
 def resume_line(folder: Path) -> str:

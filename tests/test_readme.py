@@ -10,7 +10,7 @@ import pytest
 
 from merl.cli import COMMANDS, main
 from merl.config import Source, TrainConfig
-from merl.runs.run_folder import run_path
+from merl.runs.run_folder import PRETRAINED, run_path
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -31,7 +31,7 @@ def test_each_command_names_a_run_of_an_earlier_command(
     text: str, least: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    runs: set[Path] = set()
+    runs = {Path("pretrained", path.name).absolute() for path in PRETRAINED.iterdir()}
 
     def begin(config: TrainConfig, source: Source, what: str) -> int:
         runs.add(run_path(config, source).absolute())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from bridge import Case, weights_of
+from bridge import Case
 from test_determinism import same, through_a_file
 from torch import Tensor
 
@@ -32,38 +32,6 @@ def case_of(config: AgentConfig, **values: object) -> Case:
 def train(agent: DDPG, case: Case, updates: range, step: int = 0) -> None:
     for seed in updates:
         agent.update(case.batch_of(seed), step=step)
-
-
-# -- the actor is updated in every n-th update ----------------------------------------------------
-
-
-@AGENTS
-def test_actor_is_updated_in_every_third_update(config: AgentConfig) -> None:
-    case = case_of(config, actor_every=3)
-    agent = case.agent()
-    changed: list[tuple[bool, bool]] = []
-    for seed in range(7):
-        before = weights_of(agent)
-        metrics = agent.update(case.batch_of(seed), step=0)
-        after = weights_of(agent)
-        actor, critic = (
-            not torch.equal(before[name], after[name])
-            for name in ("theta.1.weight", "phi_1.1.weight")
-        )
-        assert ("actor_loss" in metrics) == actor
-        changed.append((actor, critic))
-    assert [critic for _, critic in changed] == [True] * 7
-    assert [actor for actor, _ in changed] == [False, False, True, False, False, True, False]
-
-
-def test_saved_agent_keeps_the_count_of_updates() -> None:
-    case = case_of(MERLConfig(latent_dim=16, **SMALL), actor_every=3)
-    agent, resumed = case.agent(), case.agent(seed=9)
-    train(agent, case, range(4))
-    resumed.load_state_dict(through_a_file(agent.state_dict()))
-    for each in (agent, resumed):
-        train(each, case, range(4, 6))  # the second of these updates the actor
-    assert same(agent, resumed)
 
 
 # -- a step size that decays ---------------------------------------------------------------------

@@ -132,7 +132,6 @@ def test_config_that_does_not_fit_the_space_is_rejected(
         ("head_layers", 0),
         ("conv_channels", 0),
         ("shift_pad", -1),
-        ("actor_every", 0),
     ],
 )
 def test_error_names_the_invalid_number(name: str, value: float) -> None:

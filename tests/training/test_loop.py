@@ -426,12 +426,3 @@ def test_updates_with_batches_copied_from_the_host_give_the_same_weights(agent: 
     for each in (run, twin):
         assert each.finish()[-1].updates == 40
     assert torch.equal(run.weights(), twin.weights())
-
-
-def test_a_step_reports_the_metrics_of_all_its_updates() -> None:
-    """With the actor in every second update, the last of three updates may be without the actor."""
-    agent = dataclasses.replace(CONFIG.agent, actor_every=2)
-    run = SmallRun(dataclasses.replace(MANY, updates_per_step=3.0, agent=agent, steps=24))
-    learning = [result.learning for result in run.finish() if result.learning]
-    assert len(learning) == 4
-    assert all({"critic_loss", "actor_loss"} <= each.keys() for each in learning)

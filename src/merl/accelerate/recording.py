@@ -1,9 +1,8 @@
-"""Updates that run on a GPU alone, recorded as CUDA graphs."""
+"""Updates that run on a GPU alone, recorded as a CUDA graph."""
 
 from __future__ import annotations
 
 import gc
-from collections import Counter
 from collections.abc import Callable, Sequence
 
 import torch
@@ -16,8 +15,7 @@ from merl.core import Accelerable, Batch, UpdatePlan
 class Recorded:
     """An update that runs on the device alone; on a GPU it is recorded as a CUDA graph.
 
-    A recorded update needs a single launch. There are two kinds of update, with and without the
-    actor's step, and each kind has its own graph.
+    A recorded update needs a single launch.
 
     Args:
         agent: the learner.
@@ -26,7 +24,7 @@ class Recorded:
     """
 
     WARM_UP = 3
-    """Number of updates of each kind before this kind is recorded."""
+    """Number of updates before one is recorded."""
 
     def __init__(
         self,
@@ -40,30 +38,28 @@ class Recorded:
         self._side = torch.cuda.Stream() if self._on_gpu else None  # type: ignore[no-untyped-call]
         # A graph reads the numbers of its plan from these tensors, which change between updates.
         self._noise_std, self._step_size = (torch.zeros((), device=agent.device) for _ in range(2))
-        # The key is the kind of update: whether it includes the actor's step.
-        self._graphs: dict[bool, torch.cuda.CUDAGraph] = {}
-        self._names: dict[bool, tuple[str, ...]] = {}
-        self._values: dict[bool, Tensor] = {}  # the metrics that the graph writes
-        self._made: Counter[bool] = Counter()
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._names: tuple[str, ...] = ()  # of the metrics
+        self._values: Tensor  # the metrics that the graph writes
+        self._made = 0
 
     def __call__(self, step: int) -> dict[str, Tensor]:
         """Make one update at `step` and return its metrics, scalars on the device."""
         plan = self._agent.plan(step)
         if not self._on_gpu:
             return self._learn(plan)
-        kind = plan.trains_actor
         self._noise_std.fill_(plan.noise_std)
         self._step_size.fill_(plan.step_size)
-        plan = UpdatePlan(kind, self._noise_std, self._step_size)
-        self._made[kind] += 1
-        if self._made[kind] <= self.WARM_UP:
+        plan = UpdatePlan(self._noise_std, self._step_size)
+        self._made += 1
+        if self._made <= self.WARM_UP:
             values = self._learn_on_stream(plan)
         else:
-            if kind not in self._graphs:
-                self._graphs[kind] = self._record(plan)
-            self._graphs[kind].replay()
-            values = self._values[kind].clone()
-        return dict(zip(self._names[kind], values.unbind(), strict=True))
+            if self._graph is None:
+                self._graph = self._record(plan)
+            self._graph.replay()
+            values = self._values.clone()
+        return dict(zip(self._names, values.unbind(), strict=True))
 
     def _learn(self, plan: UpdatePlan) -> dict[str, Tensor]:
         batch = self._batch()
@@ -72,7 +68,7 @@ class Recorded:
     def _learn_on_device(self, plan: UpdatePlan) -> Tensor:
         """Make an update; return its metrics as one tensor, whose names are kept."""
         metrics = self._learn(plan)
-        self._names[plan.trains_actor] = tuple(metrics)
+        self._names = tuple(metrics)
         return torch.stack([value.float() for value in metrics.values()])
 
     def _learn_on_stream(self, plan: UpdatePlan) -> Tensor:
@@ -85,7 +81,7 @@ class Recorded:
         return values
 
     def _record(self, plan: UpdatePlan) -> torch.cuda.CUDAGraph:
-        """Record an update on the same stream: graphs of one stream share the cuBLAS workspace."""
+        """Record an update on the same stream, whose cuBLAS workspace it uses."""
         graph = torch.cuda.CUDAGraph()
         for generator in self._generators:
             graph.register_generator_state(generator)
@@ -95,7 +91,7 @@ class Recorded:
         try:
             with current, torch.cuda.graph(graph, stream=self._side):
                 try:
-                    self._values[plan.trains_actor] = self._learn_on_device(plan)
+                    self._values = self._learn_on_device(plan)
                 except Exception as error:
                     failure = error
                     raise

@@ -85,12 +85,9 @@ class AgentConfig(ObservationConfig):
     critic_high: float | None = None
     """Highest return of the histogram; if not set, 1 / (1 - discount), the bound for rewards in
     [0, 1]. Higher targets are clipped to it: set it if rewards can be above 1."""
-    actor_every: Count = 1
-    """Update the actor only in every n-th update (delayed policy updates, TD3); critic, encoders
-    and target are updated every time."""
     actor_average: Share | None = None
     """Evaluate and deploy an exponential moving average of the actor and its fusion. This is the
-    weight of the newest weights at each update of the actor, in (0, 1], e.g. 0.001; if not set,
+    weight of the newest weights at each update, in (0, 1], e.g. 0.001; if not set,
     there is no average. Exploration and updates always use the newest weights."""
     tau: Share = 0.01
     """Weight of the critic in the target network's moving average at each update, in (0, 1]."""

@@ -48,9 +48,6 @@ class DDPG:
 
     The arguments are those of `merl.agents.make_agent`, which also seeds the initial weights. In
     the config, `precision` "auto" means fp32 here.
-
-    Attributes:
-        updates: critic updates so far; they determine when the actor is updated.
     """
 
     actor_class: ClassVar[type[Actor] | type[GaussianActor]] = Actor
@@ -66,7 +63,6 @@ class DDPG:
         device: torch.device,
         threads: int | None = None,
     ) -> None:
-        self.updates = 0
         self.acting_noise: Tensor | None = None
         self.config = config
         self.device, self.threads = device, threads
@@ -130,14 +126,12 @@ class DDPG:
         return self.learn(batch.to(self.device), noise, plan)
 
     def plan(self, step: int) -> UpdatePlan:
-        """Begin an update; the last of every `actor_every` updates trains the actor."""
-        self.updates += 1
-        trains_actor = self.updates % self.config.actor_every == 0
-        return UpdatePlan(trains_actor, self.config.noise(step), self.config.step_size(step))
+        """Return the values of an update that depend on the step."""
+        return UpdatePlan(self.config.noise(step), self.config.step_size(step))
 
     @with_torch_settings
     def learn(self, batch: Batch, noise: UpdateNoise, plan: UpdatePlan) -> dict[str, Tensor]:
-        """Augment and encode the batch; update the critic, the actor if due, and the target."""
+        """Augment and encode the batch; update the critic, the actor and the target."""
         for optimizer in self.optimizers():
             set_step_size(optimizer, plan.step_size)
         encoders = self.networks.encoders
@@ -147,12 +141,11 @@ class DDPG:
             with torch.no_grad():
                 next_encoded = encoders(batch.next_observation, noise.next_shifts)
         metrics = self.update_critic(encoded, next_encoded, batch, noise.next_noise)
-        if plan.trains_actor:
-            # Reuse the features of o_t from before the critic's step, without gradient.
-            encoded = {key: features.detach() for key, features in encoded.items()}
-            metrics |= self.update_actor(encoded, noise.actor_noise)
-            if self.config.actor_average is not None:
-                self.networks.update_average(self.config.actor_average)
+        # Reuse the features of o_t from before the critic's step, without gradient.
+        encoded = {key: features.detach() for key, features in encoded.items()}
+        metrics |= self.update_actor(encoded, noise.actor_noise)
+        if self.config.actor_average is not None:
+            self.networks.update_average(self.config.actor_average)
         self.update_target()
         return metrics
 
@@ -270,7 +263,6 @@ class DDPG:
             "acting": self.acting.get_state(),
             "learning": self.learning.get_state(),
             "acting_noise": self.acting_noise,
-            "updates": self.updates,
         }
 
     @with_torch_settings
@@ -282,7 +274,6 @@ class DDPG:
         self.acting_noise = None if noise is None else noise.to(self.device)
         load_optimizer(self.critic_optimizer, state["critic_optimizer"])
         load_optimizer(self.actor_optimizer, state["actor_optimizer"])
-        self.updates = state["updates"]
         for name in ("acting", "learning"):
             generator: torch.Generator = getattr(self, name)
             # The generators of CPU and CUDA have different states: on another kind of device than

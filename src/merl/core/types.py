@@ -109,14 +109,11 @@ class UpdateNoise:
 
 
 class UpdatePlan(NamedTuple):
-    """What an update depends on besides weights, batch and noise.
+    """Values of an update that change with the step.
 
-    The numbers change with the step. They are scalar tensors on the device where the update is
-    recorded once and then repeated.
+    They are scalar tensors on the device where the update is recorded once and then repeated.
     """
 
-    trains_actor: bool
-    """Whether the update includes the actor."""
     noise_std: float | Tensor
     """Standard deviation of the action noise in the update."""
     step_size: float | Tensor
@@ -178,7 +175,7 @@ class Accelerable(Agent, Protocol):
     """An agent whose `update` is plan, draw and learn, which training can make faster.
 
     On a CPU, images are shifted while they are copied from the replay. On a GPU, draw and learn are
-    recorded as a CUDA graph: their operations depend only on `UpdatePlan.trains_actor`.
+    recorded as a CUDA graph: their operations are the same in every update.
 
     Attributes:
         device: device of the agent.
@@ -189,7 +186,7 @@ class Accelerable(Agent, Protocol):
     learning: torch.Generator
 
     def plan(self, step: int) -> UpdatePlan:
-        """Begin an update: count it, and return its plan."""
+        """Return the values of an update that depend on the step."""
         ...
 
     def draw(self, size: int, plan: UpdatePlan) -> UpdateNoise:

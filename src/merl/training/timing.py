@@ -156,7 +156,7 @@ def measure(
         try:
             with torch_settings(device):
                 agent = _agent(config, space, batch, device, arithmetic)
-                update[arithmetic] = _time_update(agent, batch, device, _cycle(config.agent))
+                update[arithmetic] = _time_update(agent, batch, device)
         except Exception as error:
             if arithmetic.compiled:
                 raise _CompileError(error) from error
@@ -236,12 +236,7 @@ def _agent(
     return agent
 
 
-def _cycle(config: ObservationConfig) -> int:
-    """Return the number of updates of which one includes the actor."""
-    return config.actor_every if isinstance(config, AgentConfig) else 1
-
-
-def _time_update(agent: Agent, batch: Batch, device: torch.device, cycle: int) -> float:
+def _time_update(agent: Agent, batch: Batch, device: torch.device) -> float:
     update: Update = lambda step: agent.update(batch, step=step)  # noqa: E731
     warm_up, repeats = 1, REPEATS  # the first update also initialises, e.g. the optimizers
     if device.type == "cuda" and isinstance(agent, Accelerable):  # as in training
@@ -249,15 +244,13 @@ def _time_update(agent: Agent, batch: Batch, device: torch.device, cycle: int) -
         update, repeats = Recorded(agent, lambda: on_device), REPEATS_ON_GPU
         warm_up = Recorded.WARM_UP + 1
 
-    def updates() -> None:
-        for _ in range(cycle):
-            metrics = update(0)
-        for value in metrics.values():
+    def timed() -> None:
+        for value in update(0).values():
             float(value)  # reading it waits for the device
 
     for _ in range(warm_up):
-        updates()
-    return _median_seconds(updates, repeats) / cycle
+        timed()
+    return _median_seconds(timed, repeats)
 
 
 class _CompileError(MerlError):

@@ -195,7 +195,7 @@ def test_the_disc_hides_half_of_the_box_in_half_of_a_thousand_starts(name):
 
 
 def test_make_task_finds_tasks_and_rejects_unsupported_options():
-    assert list(TASKS) == ["reach_duplo", "move_box", "lift_box"]
+    assert {"reach_duplo", "move_box", "lift_box"} <= {*TASKS}
     with pytest.raises(MerlError, match="did you mean 'move_box'"):
         make_task("move_boxes")
     with pytest.raises(MerlError, match="reach_duplo has no occluded form: choose from move_box"):

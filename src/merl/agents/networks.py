@@ -62,7 +62,7 @@ class Networks(nn.Module):
     @property
     def senses(self) -> tuple[str, ...]:
         """Observation keys that the actor uses."""
-        return self._fusion_of_actor().modalities
+        return self._fusion_of_actor().keys
 
     def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
         """Return the actions (B, A) without noise, in [-1, 1]: the policy that is deployed.

@@ -27,6 +27,7 @@ COMMANDS = {
     "train": "train an agent on a task",
     "resume": "continue a run that was stopped",
     "evaluate": "run a trained policy, record a video",
+    "robustness": "evaluate a policy while its senses are disturbed",
     "tasks": "list the tasks, with an image of each",
     "info": "show versions, hardware and the expected speed",
     "bench": "compare merl's speed with a reference",

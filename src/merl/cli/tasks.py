@@ -53,8 +53,9 @@ def tasks(args: list[str]) -> int:
 
 
 def _entry(name: str, image: NDArray[np.uint8], console: Console) -> Table:
-    about = (TASKS[name].__doc__ or "").strip().splitlines()[0]
-    terms = TASKS[name]().term_names
+    task = TASKS[name]()
+    about = (type(task).__doc__ or name).strip().splitlines()[0]
+    terms = task.term_names
     lines = [
         Text(name, style="bold"),
         Text(about),

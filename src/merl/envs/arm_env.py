@@ -52,7 +52,10 @@ class ArmEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.task, self.config, self.render_mode = task, config, render_mode
         if "touch" in keys:
             task.robot.add_touch_sensors()
-        self._wrist = task.robot.add_wrist_camera() if {"wrist", "wrist_depth"} & keys else ""
+        self._cameras = dict.fromkeys(("image", "depth"), CAMERA.name)
+        if {"wrist", "wrist_depth"} & keys:
+            wrist = task.robot.add_wrist_camera()
+            self._cameras |= dict.fromkeys(("wrist", "wrist_depth"), wrist)
         self._physics: Any = self._compile()
         self._renderers: dict[tuple[str, int, int], Renderer] = {}  # by camera, size and samples
         self._steps_left = 0
@@ -179,20 +182,22 @@ class ArmEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _read(self, key: ObservationKey) -> NDArray[Any]:
         """Return the current value of a key."""
         robot, physics, config = self.task.robot, self._physics, self.config
+        match OBSERVATION_KINDS[key]:
+            case "image":
+                size, samples = config.image_size, config.samples
+                return self._renderer(self._cameras[key], size, samples).render()
+            case "depth":
+                renderer = self._renderer(self._cameras[key], config.image_size, 1)
+                return renderer.render_depth().clip(*DEPTH_RANGE)[..., None]
         match key:
-            case "image" | "wrist":
-                camera = self._wrist if key == "wrist" else CAMERA.name
-                return self._renderer(camera, config.image_size, config.samples).render()
-            case "depth" | "wrist_depth":
-                camera = self._wrist if key == "wrist_depth" else CAMERA.name
-                depth = self._renderer(camera, config.image_size, 1).render_depth()
-                return depth.clip(*DEPTH_RANGE)[..., None]
             case "touch":
                 return robot.touch(physics)
             case "proprio":
                 return robot.proprio(physics, config.proprio)
             case "state":
                 return self.task.state(physics, config.state)
+            case _:
+                raise AssertionError(f"no value for {key}")
 
     def _space(self, key: ObservationKey) -> spaces.Box:
         size = self.config.image_size

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ class Policy:
     Attributes:
         agent: the agent; for merl's own, `agent.networks` is the policy as a torch module.
         config: the config of its run.
+        modalities: the modality of each key that the policy uses.
         step: environment steps at which the policy was saved.
         reports_success: whether the environment was known to report success at that step.
     """
@@ -57,9 +58,9 @@ class Policy:
         self.reports_success = reports_success
         self.agent = agent
         known = modalities_of(space)
-        modalities = {key: known[key] for key in agent.senses}
-        self._keys = {key: UserKey.as_trained(key, m) for key, m in modalities.items()}
-        self._stack = FrameStack(modalities, config.replay.frame_stack, device)
+        self.modalities = {key: known[key] for key in agent.senses}
+        self._keys = {key: UserKey.as_trained(key, m) for key, m in self.modalities.items()}
+        self._stack = FrameStack(self.modalities, config.replay.frame_stack, device)
         self._fresh = True
 
     def reset(self) -> None:
@@ -139,6 +140,7 @@ class Policy:
         renderer: str | None = None,
         max_episode_steps: int | None = None,
         env: MakeEnv | None = None,
+        wrap: Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]] = lambda made: made,
         trust: bool = False,
     ) -> Evaluation:
         """Run episodes without noise, from the evaluation's fixed start states.
@@ -150,6 +152,7 @@ class Policy:
             max_episode_steps: limit in steps for episodes that do not end earlier; None: as in the
                 run.
             env: see `make_env`.
+            wrap: changes the environment after it was made, e.g. with a wrapper.
             trust: see `make_env`.
 
         Raises:
@@ -170,7 +173,7 @@ class Policy:
         try:
             return evaluate(
                 self,
-                made,
+                wrap(made),
                 episodes,
                 reset=self.reset,
                 video=video,

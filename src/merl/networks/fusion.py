@@ -28,7 +28,7 @@ class Fusion(nn.Module):
 
     Attributes:
         latent_dim: d, the length of the latent.
-        modalities: the keys, in the order of concatenation.
+        keys: the keys, in the order of concatenation.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Fusion(nn.Module):
         super().__init__()
         self.layer = layer
         self.latent_dim = share * len(features)
-        self.modalities = tuple(features)
+        self.keys = tuple(features)
         self.projections = nn.ModuleDict(
             {module_name(key): nn.Linear(n, share) for key, n in features.items()}
         )
@@ -58,7 +58,7 @@ class Fusion(nn.Module):
     def forward(self, encoded: Mapping[str, Tensor]) -> Tensor:
         """Fuse encodings {key: (B, F_key)} to the latent (B, d), each entry in [-1, 1]."""
         latents = []
-        layers = zip(self.modalities, self.projections.values(), self.norms.values(), strict=True)
+        layers = zip(self.keys, self.projections.values(), self.norms.values(), strict=True)
         for key, projection, norm in layers:
             projected = projection(encoded[key]).to(projection.weight.dtype)
             latents.append(norm(projected))
@@ -83,14 +83,14 @@ class Concatenation(nn.Module):
 
     Attributes:
         latent_dim: the sum of the lengths.
-        modalities: the keys, in the order of concatenation.
+        keys: the keys, in the order of concatenation.
     """
 
     def __init__(self, features: Mapping[str, int]) -> None:
         super().__init__()
         self.latent_dim = sum(features.values())
-        self.modalities = tuple(features)
+        self.keys = tuple(features)
 
     def forward(self, encoded: Mapping[str, Tensor]) -> Tensor:
         """Concatenate encodings {key: (B, F_key)} to (B, sum of F_key)."""
-        return torch.cat([encoded[key] for key in self.modalities], dim=-1)
+        return torch.cat([encoded[key] for key in self.keys], dim=-1)

@@ -133,7 +133,7 @@ class BoxTask(ArmTask):
 
     def _close_fingers(self, physics: mjcf.Physics, *, box_is_fixed: bool) -> None:
         velocities = np.zeros(physics.model.nu)
-        velocities[-len(self.robot.hand.joints) :] = CLOSING_VELOCITY
+        velocities[physics.bind(self.robot.hand.actuators).element_id] = CLOSING_VELOCITY
         physics.set_control(velocities)
         box = physics.bind(self._prop_frame.freejoint)
         pose = np.array(box.qpos)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from dm_control import mjcf
+from dm_control.entities.manipulators.kinova import JacoHand
 
 from merl.core import MerlError
 from merl.tasks.arm_task import ArmTask
@@ -74,8 +75,8 @@ class Expert:
     """
 
     def __init__(self, task: ArmTask, physics: mjcf.Physics) -> None:
-        if type(task) not in PLANS:
-            raise MerlError(f"task {type(task).__name__} has no scripted expert")
+        if type(task) not in PLANS or not isinstance(task.robot.hand, JacoHand):
+            raise MerlError(f"task {type(task).__name__} has no scripted expert for its robot")
         self.task, self.physics = task, physics
         self.arm = Kinematics(task, physics)
         self._low, self._high = physics.model.actuator_ctrlrange.T.copy()

@@ -1,0 +1,54 @@
+"""The command merl robustness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from merl.cli.output import make_console
+from merl.cli.parsing import RunOptions, parse
+from merl.cli.running import tell_trusted
+from merl.core import MerlError
+from merl.core.fields import Range
+from merl.evaluation.policy import load_policy
+from merl.evaluation.robustness import robustness as evaluations
+from merl.report.robustness import Row, draw_rows, write_rows
+from merl.runs.run import Run
+
+
+@dataclass(frozen=True)
+class RobustnessOptions(RunOptions):
+    """Evaluate a trained policy while its senses, its actions or the scene are disturbed."""
+
+    episodes: Annotated[int, Range(1)] = 50
+    """Number of episodes for each disturbance."""
+    checkpoint: str = "latest"
+    """latest, best (the highest evaluation return), or the step of a checkpoint."""
+    out: Path | None = None
+    """Folder for robustness.csv and robustness.png; by default robustness/ and the run's name."""
+
+
+def robustness(args: list[str]) -> int:
+    """Disturb a policy: merl robustness RUN [--episodes N] [--out DIR] ..."""
+    options = parse(RobustnessOptions, "merl robustness", args)
+    console = make_console()
+    if options.trust:
+        tell_trusted(Run.open(options.run))
+    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    out = (options.out or Path("robustness", options.run.resolve().name)).absolute()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MerlError(f"--out {out} cannot be created: {error.strerror}") from None
+    console.print(f"{options.run} at step {policy.step:,}", highlight=False)
+    rows: list[Row] = []
+    for each in evaluations(policy, options.episodes, trust=options.trust):
+        it, how = each.evaluation, each.disturbance
+        row = Row.of(how.sense, how.name, len(it.episodes), it.returns, it.success_end)
+        rows.append(row)
+        console.print(f"{row.sense:8} {row.disturbance:14} {row.text}", highlight=False)
+        write_rows(rows, out / "robustness.csv")
+    figure = draw_rows(rows, f"{policy.config.task} under disturbances", out / "robustness.png")
+    console.print(f"{figure}", highlight=False, soft_wrap=True)
+    return 0

@@ -145,7 +145,7 @@ class TrainConfig:
                 f"agent {self.agent_name!r} needs a config of type {kind.__name__}, not "
                 f"{type(self.agent).__name__}"
             )
-        if self.eval.start is not None and self.own_env:
+        if self.eval.start is not None and self.has_user_env:
             raise MerlError(
                 f"eval.start is for merl's own tasks only: {self.task} sets its own start states; "
                 "leave the option out"
@@ -159,7 +159,7 @@ class TrainConfig:
             )
 
     @property
-    def own_env(self) -> bool:
+    def has_user_env(self) -> bool:
         """Return whether the environment is the user's own and not one of merl's tasks."""
         return self.task not in ENV_IDS
 

@@ -48,7 +48,7 @@ def make_run_env(
     """
     render_mode = changes.pop("render_mode", None)
     env: gymnasium.Env[Any, Any]
-    if config.own_env:
+    if config.has_user_env:
         changes.pop("render_size", None)
         if changes:
             raise MerlError(

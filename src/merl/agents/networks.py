@@ -260,7 +260,7 @@ def _encoder(
         raise MerlError(f"observation {key!r}: {error}") from None
 
 
-def own_encoders(config: ObservationConfig) -> tuple[str, ...]:
+def user_encoders(config: ObservationConfig) -> tuple[str, ...]:
     """Return the encoders that a config names as `module:Class`."""
     if not isinstance(config, AgentConfig):
         return ()

@@ -65,7 +65,7 @@ def evaluate(args: list[str]) -> int:
     )
     config = policy.config
     renderer = options.renderer or policy.config.env.renderer
-    images = "" if policy.config.own_env else f", {renderer} images"
+    images = "" if policy.config.has_user_env else f", {renderer} images"
     line = f"{options.run} at step {policy.step:,}{images}: {describe(result)}"
     console.print(line, highlight=False)
     known = references(config.task, config.evaluated.env)

@@ -126,7 +126,7 @@ def _outlook(setup: Setup, what: str, done: int) -> str:
     config, timing = setup.config, setup.timing
     size = decimal(setup.replay_spec.bytes)
     updates = ", ".join(f"{1000 * s:.3g} ms in {how}" for how, s in timing.update.items())
-    has_images = not config.own_env and any(m.stacked for m in setup.spec.modalities.values())
+    has_images = not config.has_user_env and any(m.stacked for m in setup.spec.modalities.values())
     images = f" ({config.env.renderer} images)" if has_images else ""
     lines = [f"{what}: {duration(config, timing, done)}"]
     lines += key_lines(config, setup.env)

@@ -113,7 +113,7 @@ def _refuse_foreign(config: TrainConfig, default: TrainConfig) -> None:
     """
     before = flat(default)
     changed = [name for name, value in flat(config).items() if value != before[name]]
-    if config.own_env:
+    if config.has_user_env:
         flags = [name.partition(".")[2] for name in changed if name.startswith("env.")]
         whose = f"merl's own tasks: {config.task} defines its own observations"
     else:

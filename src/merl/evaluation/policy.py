@@ -111,9 +111,9 @@ class Policy:
                 training.
         """
         renderer = changes.get("renderer", self.config.env.renderer)
-        if renderer == "auto" and not self.config.own_env:
+        if renderer == "auto" and not self.config.has_user_env:
             renderer = changes["renderer"] = self.config.env.renderer
-        if renderer != self.config.env.renderer and not self.config.own_env:
+        if renderer != self.config.env.renderer and not self.config.has_user_env:
             _LOG.warning(
                 "the agent was trained with renderer %r but now uses %r: their images differ, and "
                 "the agent may perform worse",
@@ -124,7 +124,7 @@ class Policy:
         if self._run is not None and env is None:
             self._run.load_module(trusted=trust)
         made = make_run_env(self.config.evaluated, env, **changes)
-        if self._run is not None and self.config.own_env:
+        if self._run is not None and self.config.has_user_env:
             try:
                 self._run.check_environment(*run_spaces(self.config, made), own_bounds(made))
             except BaseException:

@@ -119,13 +119,13 @@ def disturbances(policy: Policy, scales: Mapping[str, Value]) -> Iterator[Distur
             yield Disturbance(
                 "joints", name, partial(Changed, changes=dict.fromkeys(numbers, change))
             )
-        for name, change in (("noise", _noisy), ("bias", _biased)):
+        for name, disturbed in (("noise", _noisy), ("bias", _biased)):
             for share in SHARES:
-                changes = {key: partial(change, share * scales[key]) for key in numbers}
+                changes = {key: partial(disturbed, share * scales[key]) for key in numbers}
                 yield Disturbance("joints", f"{name} {share:g}", partial(Changed, changes=changes))
     for steps in DELAYS:
         yield Disturbance("actions", f"delayed by {steps}", partial(LateActions, steps=steps))
-    if frames and not policy.config.own_env:
+    if frames and not policy.config.has_user_env:
         yield Disturbance("scene", "darker light", _with_darker_light)
         yield Disturbance("scene", "other floor", _with_other_floor)
 

@@ -32,15 +32,15 @@ class Preset:
         agent: values of the agent's config that differ from the agent's defaults, for every agent
             that is based on merl's learner.
         agent_name: the default agent.
-        own_env: values that differ for a user's own environment. It may be a robot: there is only
-            one, and its steps cost more than updates.
+        for_user_env: values that differ for a user's own environment. It may be a robot: there is
+            only one, and its steps cost more than updates.
     """
 
     about: str
     config: TrainConfig
     agent: Mapping[str, Any] = field(default_factory=dict)
     agent_name: str = "merl"
-    own_env: Mapping[str, Any] = field(default_factory=dict)
+    for_user_env: Mapping[str, Any] = field(default_factory=dict)
 
 
 PRESETS: dict[str, Preset] = {
@@ -71,7 +71,7 @@ PRESETS: dict[str, Preset] = {
             "learning_rate_end": 1e-4,
             "learning_rate_steps": 400_000,
         },
-        own_env={
+        for_user_env={
             "steps": 150_000,
             "random_steps": 1000,
             "seed_steps": 2000,
@@ -95,7 +95,7 @@ PRESETS: dict[str, Preset] = {
         ),
         {"hidden_dim": 256, "learning_rate": 3e-4, "standardize": True, "precision": "fp32"},
         "merl_state",
-        own_env={"random_steps": 5000, "seed_steps": 5000, "updates_per_step": 1.0},
+        for_user_env={"random_steps": 5000, "seed_steps": 5000, "updates_per_step": 1.0},
     ),
     "smoke": Preset(
         "the whole pipeline in under a minute: shows that it works, learns nothing",
@@ -180,7 +180,9 @@ def compose(
     check_choice("setting", setting, get_args(Setting))
     config = dataclasses.replace(chosen.config, task=task)
     # A user's environment may be a robot, which must not move unless asked.
-    config = override(config, chosen.own_env if config.own_env else {"eval.references": True})
+    config = override(
+        config, chosen.for_user_env if config.has_user_env else {"eval.references": True}
+    )
     values = _agent_values(base, preset, config) if isinstance(base, AgentConfig) else {}
     if setting == "published":
         if name not in PUBLISHED:

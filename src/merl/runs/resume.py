@@ -112,7 +112,7 @@ def merge_resume_config(
         for name in {**before, **after}
         if before.get(name) != after.get(name)
         and name != "run_dir"
-        and not (recorded.own_env and name.startswith("env."))  # only for merl's own tasks
+        and not (recorded.has_user_env and name.startswith("env."))  # only for merl's own tasks
         and name != "minutes"  # counted since the resume
         and (name in given_open or name not in open_fields)
     }

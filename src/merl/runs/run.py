@@ -24,7 +24,7 @@ from gymnasium import spaces
 
 from merl.agents import find_agent
 from merl.agents.config import UnloadedConfig
-from merl.agents.networks import own_encoders
+from merl.agents.networks import user_encoders
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, user_code
 from merl.envs.user_env import imports_code, load_module
@@ -186,7 +186,7 @@ class Run:
         Raises:
             MerlError: the import is not allowed (`trust.check`), or it fails.
         """
-        for name in own_encoders(self.config.agent):
+        for name in user_encoders(self.config.agent):
             user_code.load_module(name, *self._folders_of(name, trusted, named_in), kind="encoder")
 
     def _folders_of(self, name: str, trusted: bool, named_in: Path | None) -> list[Path]:

@@ -21,7 +21,7 @@ from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
 from merl.acting.workers import WorkerEnvs, check_sendable
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
-from merl.agents.networks import make_networks, own_encoders
+from merl.agents.networks import make_networks, user_encoders
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import Agent, MerlError, counted, user_code
 from merl.core.resources import available_memory, keep_freed_memory
@@ -141,9 +141,9 @@ class Setup:
         home = Path.cwd()  # before user code runs, which may change the working folder
         if new:
             refuse_existing(run_path(config, source, home))
-            if config.own_env and ":" in config.task and make is None:
+            if config.has_user_env and ":" in config.task and make is None:
                 load_module(config.task, home)
-            for name in own_encoders(config.agent):
+            for name in user_encoders(config.agent):
                 user_code.load_module(name, home, kind="encoder")
         if config.has_workers:
             check_sendable(config, make)
@@ -162,12 +162,12 @@ class Setup:
             if config.eval.every:
                 size = max(config.env.render_size, MIN_SIDE)
                 # Without videos, avoid the reset that tests whether a user's environment renders.
-                mode = None if config.own_env and config.eval.video == "none" else "rgb_array"
+                mode = None if config.has_user_env and config.eval.video == "none" else "rgb_array"
                 eval_env = make_run_env(config.evaluated, make, render_mode=mode, render_size=size)
                 stack.callback(eval_env.close)
                 expected = EnvSpaces.of(config, env)
                 expected.check(EnvSpaces.of(config, eval_env), "the one for evaluations")
-                if config.own_env:
+                if config.has_user_env:
                     check_instances(env, eval_env)
             yield cls(config, env, eval_env, home, replay_spec, make)
 

@@ -171,11 +171,11 @@ def measure(
     torch.set_num_threads(threads)
     with torch_settings(device):
         step, frame = _time_acting(agent, batch, device), 0.0
-    if not config.own_env:
+    if not config.has_user_env:
         makes_videos = config.eval.video != "none" and eval_env.render_mode == "rgb_array"
         frame = _time_frame(eval_env) if makes_videos else 0.0
         step += _time_step(env)
-    timing = Timing(update, step, frame, knows_env=not config.own_env)
+    timing = Timing(update, step, frame, knows_env=not config.has_user_env)
     if not worth_compiling(config, timing, device):
         return timing
     print("merl: trying torch.compile once, which takes a minute or two", file=sys.stderr)

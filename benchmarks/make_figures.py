@@ -12,7 +12,7 @@ import numpy as np
 from merl.core.statistics import bootstrap_interval, wilson_interval
 from merl.experiments.small_tasks import SPLIT, optimum, returns_of
 from merl.report.curves import Curve, curve_of, read_metrics
-from merl.report.figures import learning_curves
+from merl.report.figures import learning_curves, reward_terms
 from merl.report.references import references
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,6 +20,7 @@ DATA, IMAGES = ROOT / "results", ROOT / "docs/images"
 AGENTS = DATA / "agents"
 MOST = {"state": 100_000, "laptop": 100_000}
 """Steps up to which the agents are compared, by preset."""
+BOXES = ("move_box", "lift_box")
 COMPARED = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", "proprio")}
 
 
@@ -28,6 +29,7 @@ def main() -> None:
     laptop()
     agents()
     small_tasks()
+    boxes()
     for file in sorted(AGENTS.glob("*-evaluation.json")):
         print(table_row(file))
 
@@ -80,6 +82,13 @@ def seeds(task: str, agent: str, preset: str) -> list[Curve]:
         files = sorted(DATA.glob("laptop-seed?.csv"))  # these runs are merl's on reach_duplo
     whole = [curve_of(read_metrics(file), "eval/return") for file in files]
     return [Curve(*(part[one.steps <= MOST[preset]] for part in one)) for one in whole]
+
+
+def boxes() -> None:
+    """Draw the terms of the reward of the tasks with a box, from the state and mixed starts."""
+    runs = {task: DATA / f"runs/{task}-merl_state-carrying-s0.csv" for task in BOXES}
+    titles = {f"{task}, from the state, mixed starts": path for task, path in runs.items()}
+    reward_terms(titles, IMAGES / "boxes.png")
 
 
 def small_tasks() -> None:

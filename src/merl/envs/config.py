@@ -6,12 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from merl.core import Kind, MerlError
-from merl.core.choices import (
-    HandStart,
-    ProprioSet,
-    RewardForm,
-    StateSet,
-)
+from merl.core.choices import HandStart, ProprioSet, RewardForm, StateSet
 from merl.core.fields import NOT_EMPTY, Range, check_fields
 from merl.rendering.config import (
     AUTO_RENDERER,

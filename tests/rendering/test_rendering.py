@@ -115,7 +115,7 @@ def test_the_mark_of_move_box_is_visible(renderer, request):
     def green_pixels(box):
         env._physics.data.qpos[-7:-4] = box
         env._physics.forward()
-        red, green, blue = np.moveaxis(env._image(84).astype(int), 2, 0)
+        red, green, blue = np.moveaxis(env._read("image").astype(int), 2, 0)
         return int(((green > 2 * red) & (green > 2 * blue) & (green > 60)).sum())
 
     env.reset(seed=0)

@@ -142,18 +142,3 @@ def test_a_working_compilation_is_timed(monkeypatch: pytest.MonkeyPatch) -> None
     assert set(result.update) == {FP32, compiled}
     assert result.not_compiled is None
     assert compiled.decided(CONFIG.agent).torch_compile == "yes"
-
-
-def test_timing_averages_updates_with_and_without_the_actor(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    clock, made = [0.0], [0]
-
-    class Agent:
-        def update(self, batch: object, *, step: int) -> dict[str, torch.Tensor]:
-            made[0] += 1
-            clock[0] += 5.0 if made[0] % 3 == 0 else 2.0
-            return {"critic_loss": torch.tensor(0.0)}
-
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
-    assert timing._time_update(Agent(), None, torch.device("cpu"), 3) == 3.0  # type: ignore[arg-type]

@@ -236,7 +236,7 @@ def make_loggers(names: Iterable[str]) -> list[Logger]:
         MerlError: a name is unknown, or an extra is not installed.
     """
     for name in names:
-        check_choice("log", name, tuple(LOGGERS))
+        check_choice("--log", name, tuple(LOGGERS))
     return [LOGGERS[name]() for name in dict.fromkeys(names)]
 
 

@@ -114,7 +114,7 @@ def _log_warning(message: Warning | str, category: type[Warning], *_: Any, **__:
 
 
 def _usage() -> str:
-    commands = [f"  {name:<10}{about}" for name, about in COMMANDS.items()]
+    commands = [f"  {name:<12}{about}" for name, about in COMMANDS.items()]
     return "\n".join(
         [
             "usage: merl COMMAND ...",
@@ -122,6 +122,7 @@ def _usage() -> str:
             *commands,
             "",
             "merl COMMAND --help shows its options, merl --version the version.",
+            "A trained arm: merl evaluate pretrained/reach_duplo --video arm.mp4",
             "A first run, in under a minute: merl train reach_duplo --preset smoke",
         ]
     )

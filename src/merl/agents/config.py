@@ -87,8 +87,8 @@ class AgentConfig(ObservationConfig):
     [0, 1]. Higher targets are clipped to it: set it if rewards can be above 1."""
     actor_average: Share | None = None
     """Evaluate and deploy an exponential moving average of the actor and its fusion. This is the
-    weight of the newest weights at each update, in (0, 1], e.g. 0.001; if not set,
-    there is no average. Exploration and updates always use the newest weights."""
+    weight of the newest weights at each update, in (0, 1], e.g. 0.001; if not set, there is no
+    average. Exploration and updates always use the newest weights."""
     tau: Share = 0.01
     """Weight of the critic in the target network's moving average at each update, in (0, 1]."""
     noise_std: NotNegative = 0.2

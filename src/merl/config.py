@@ -193,7 +193,8 @@ def override(config: T, values: Mapping[str, Any], prefix: str = "") -> T:
     Args:
         config: a config.
         values: {field: value}; the field of a nested config by its dotted name, e.g.
-            `agent.noise_std`. A `-` in a name counts as `_`.
+            `agent.noise_std`, a key of a dictionary likewise (`agent.encoders.wrist`). A `-` in the
+            name of a field counts as `_`.
         prefix: precedes the names in messages.
 
     Raises:
@@ -203,8 +204,10 @@ def override(config: T, values: Mapping[str, Any], prefix: str = "") -> T:
     nested: dict[str, dict[str, Any]] = {}
     names = [field.name for field in fields(config)]
     for name, value in values.items():
-        first, _, rest = name.replace("-", "_").partition(".")
-        if first not in names or (rest and not is_dataclass(getattr(config, first))):
+        first, _, rest = name.partition(".")
+        first = first.replace("-", "_")
+        part = getattr(config, first, None)
+        if first not in names or (rest and not (is_dataclass(part) or isinstance(part, dict))):
             raise MerlError(f"config {prefix}{name!r} is unknown: {suggest(first, names)}")
         if rest:
             nested.setdefault(first, {})[rest] = value
@@ -212,7 +215,10 @@ def override(config: T, values: Mapping[str, Any], prefix: str = "") -> T:
             changes[first] = value
     for first, inner in nested.items():
         part = changes.get(first, getattr(config, first))
-        changes[first] = override(part, inner, f"{prefix}{first}.")
+        if is_dataclass(part):
+            changes[first] = override(part, inner, f"{prefix}{first}.")
+        else:
+            changes[first] = part | inner
     return replace(config, **changes)
 
 

@@ -28,6 +28,7 @@ COMMANDS = {
     "resume": "continue a run that was stopped",
     "evaluate": "run a trained policy, record a video",
     "robustness": "evaluate a policy while its senses are disturbed",
+    "sweep": "run the experiments of the paper, or your own",
     "tasks": "list the tasks, with an image of each",
     "info": "show versions, hardware and the expected speed",
     "bench": "compare merl's speed with a reference",

@@ -92,6 +92,20 @@ def imports_code(task: str) -> bool:
     return spec is not None and not str(spec.entry_point).startswith("gymnasium.envs.")
 
 
+def check_task(task: str) -> None:
+    """Check that a name can be a task; import nothing.
+
+    Raises:
+        MerlError: it is neither a task of merl nor registered with Gymnasium, and names no module.
+    """
+    if task in ENV_IDS or ":" in task or task in registry:
+        return
+    way = installing(task) or suggest(task, [*ENV_IDS, *registry], CLOSE)
+    if not way.startswith(("did", "it comes")):
+        way = f"choose from {', '.join(ENV_IDS)}, or name a Gymnasium id or module:function"
+    raise MerlError(f"task {task!r} is unknown: {way}")
+
+
 def load_module(task: str, *folders: Path) -> ModuleType:
     """Import the module of `module:function` or `module:Id-v0`; see `user_code.load_module`."""
     if task in BUNDLED:
@@ -120,11 +134,7 @@ def _make(task: str, render_mode: str | None, make: Any = None) -> gymnasium.Env
         known = next(task for task, known in ENV_IDS.items() if known == env_id)
         raise MerlError(f"task {task!r} is a task of merl: use its name, {known}")
     if not colon:
-        if task not in registry:
-            way = installing(task) or suggest(task, [*ENV_IDS, *registry], CLOSE)
-            if not way.startswith(("did", "it comes")):
-                way = f"choose from {', '.join(ENV_IDS)}, or name a Gymnasium id or module:function"
-            raise MerlError(f"task {task!r} is unknown: {way}")
+        check_task(task)
         return _by_id(task, render_mode)
     found = load_module(task)
     make = getattr(found, name, None)

@@ -22,6 +22,7 @@ __all__ = [
     "LiftBox",
     "MoveBox",
     "ReachDuplo",
+    "check_options",
     "check_versions",
     "make_task",
 ]
@@ -51,6 +52,20 @@ def make_task(
     Raises:
         MerlError: the task is unknown, or does not support one of the options.
     """
+    check_options(name, occluded, starts, reward)
+    if name in BOX_TASKS:
+        return BOX_TASKS[name](occluded=occluded, starts=starts, reward=reward)
+    return TASKS[name]()
+
+
+def check_options(
+    name: str, occluded: bool, starts: tuple[HandStart, ...], reward: RewardForm
+) -> None:
+    """Check that a task supports these options of `make_task`.
+
+    Raises:
+        MerlError: the task is unknown, or does not support one of the options.
+    """
     if name not in TASKS:
         raise MerlError(f"task {name!r} is unknown: {suggest(name, TASKS)}")
     if name in BOX_TASKS:
@@ -58,7 +73,7 @@ def make_task(
             raise MerlError(
                 "occluded needs --start above: the disc leaves no space for the hand at the box"
             )
-        return BOX_TASKS[name](occluded=occluded, starts=starts, reward=reward)
+        return
     if occluded:
         raise MerlError(f"{name} has no occluded form: choose from {', '.join(BOX_TASKS)}")
     if starts != ABOVE:
@@ -71,4 +86,3 @@ def make_task(
             f"{name} has no reward {reward!r}, only 'paper': choose from {', '.join(BOX_TASKS)} "
             "for other rewards"
         )
-    return TASKS[name]()

@@ -206,7 +206,7 @@ def override(config: T, values: Mapping[str, Any], prefix: str = "") -> T:
     for name, value in values.items():
         first, _, rest = name.partition(".")
         first = first.replace("-", "_")
-        part = getattr(config, first, None)
+        part: Any = getattr(config, first, None)
         if first not in names or (rest and not (is_dataclass(part) or isinstance(part, dict))):
             raise MerlError(f"config {prefix}{name!r} is unknown: {suggest(first, names)}")
         if rest:
@@ -215,10 +215,8 @@ def override(config: T, values: Mapping[str, Any], prefix: str = "") -> T:
             changes[first] = value
     for first, inner in nested.items():
         part = changes.get(first, getattr(config, first))
-        if is_dataclass(part):
-            changes[first] = override(part, inner, f"{prefix}{first}.")
-        else:
-            changes[first] = part | inner
+        nests = is_dataclass(part)
+        changes[first] = override(part, inner, f"{prefix}{first}.") if nests else part | inner
     return replace(config, **changes)
 
 

@@ -29,6 +29,8 @@ COMMANDS = {
     "evaluate": "run a trained policy, record a video",
     "robustness": "evaluate a policy while its senses are disturbed",
     "sweep": "run the experiments of the paper, or your own",
+    "report": "draw and compare learning curves",
+    "compare": "print what differs between two runs",
     "tasks": "list the tasks, with an image of each",
     "info": "show versions, hardware and the expected speed",
     "bench": "compare merl's speed with a reference",

@@ -14,6 +14,9 @@ from merl.core.errors import (
 )
 from merl.core.types import (
     CONFIG_FILE,
+    EVALUATION_FILE,
+    HARMLESS,
+    LOCK_FILE,
     METRICS_FILE,
     Accelerable,
     Agent,
@@ -29,6 +32,9 @@ from merl.core.types import (
 
 __all__ = [
     "CONFIG_FILE",
+    "EVALUATION_FILE",
+    "HARMLESS",
+    "LOCK_FILE",
     "METRICS_FILE",
     "Accelerable",
     "Agent",

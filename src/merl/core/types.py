@@ -35,6 +35,31 @@ CONFIG_FILE = "config.json"
 """File in a run folder that holds the config of the run."""
 METRICS_FILE = "metrics.csv"
 """File in a run folder that holds the metrics of the run."""
+LOCK_FILE = "lock"
+"""File in a run folder that the process that trains the run locks."""
+EVALUATION_FILE = "evaluation.json"
+"""File in a run folder that holds the evaluation at the end, if a sweep trained the run."""
+HARMLESS = (
+    "steps",
+    "minutes",
+    "worker_restarts",
+    "worker_timeout",
+    "save_every",
+    "log",
+    "keep",
+    "device",
+    "threads",
+    "env.render_size",
+    "eval.every",
+    "eval.episodes",
+    "eval.max_episode_steps",
+    "eval.video",
+    "eval.references",
+    "agent.precision",
+    "agent.torch_compile",
+)
+"""Fields of a run's config that affect its length, speed and monitoring, but not what it learns.
+They may change on resume, and runs that differ in them alone are compared as seeds."""
 
 
 @dataclass(frozen=True)

@@ -75,8 +75,7 @@ def run_on_ray(
                 done, _ = ray.wait([*waiting], timeout=1.0)
                 for reference in done:
                     run = waiting.pop(reference)
-                    error = _error(ray, reference)
-                    ended(Outcome(run.name, error, time.monotonic() - begin))
+                    ended(Outcome(run.name, _error(ray, reference), time.monotonic() - begin))
                 tick([*waiting.values()])
             for reference in waiting:
                 ray.cancel(reference, force=False)

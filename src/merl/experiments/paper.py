@@ -70,7 +70,7 @@ EXPERIMENTS = {
     "occluded": Experiment(
         "A disc hides the object from the camera",
         (
-            Variant("merl_occluded", values=OCCLUDED | MERL.values),
+            Variant("merl_occluded", values={**OCCLUDED, **MERL.values}),
             Variant("drqv2_occluded", "drqv2", OCCLUDED),
             Variant("proprio_occluded", "proprio", OCCLUDED),
         ),

@@ -20,12 +20,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from merl.core import METRICS_FILE, MerlError
+from merl.core import EVALUATION_FILE, LOCK_FILE, METRICS_FILE, MerlError
 from merl.core.signals import Interrupt
 from merl.experiments.experiment import PlannedRun
-from merl.runs.run_folder import LOCK_FILE
 
-EVALUATION_FILE = "evaluation.json"
 ENVIRONMENT_FAILED = 4
 """Exit code after which a run is tried again, as after a crash. Others are the user's to fix."""
 POLL = 0.2

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -174,9 +175,13 @@ def save(figure: Figure, output: Path) -> Path:
         MerlError: the file cannot be written, or its suffix is unknown.
     """
     part = output.with_name(f".{output.stem}.part{output.suffix}")
+    # In SVG, text stays text, and the same figure gives the same file.
+    options: Any = {"svg.fonttype": "none", "svg.hashsalt": output.stem}
+    metadata = {"Date": None} if output.suffix == ".svg" else None
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(part)
+        with rc_context(options):
+            figure.savefig(part, metadata=metadata)
         part.replace(output)
     except (OSError, ValueError) as error:  # ValueError: a suffix that matplotlib does not know
         with contextlib.suppress(OSError):

@@ -7,29 +7,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from merl.config import TrainConfig, flat, override
-from merl.core import MerlError
+from merl.core import HARMLESS, MerlError
 
-HARMLESS = (
-    "steps",
-    "minutes",
-    "worker_restarts",
-    "worker_timeout",
-    "save_every",
-    "log",
-    "keep",
-    "device",
-    "threads",
-    "env.render_size",
-    "eval.every",
-    "eval.episodes",
-    "eval.max_episode_steps",
-    "eval.video",
-    "eval.references",
-    "agent.precision",
-    "agent.torch_compile",
-)
-"""Fields that may change on resume: they affect the length, speed and monitoring of a run, but not
-what it learns."""
 _LEFT_OPEN = {
     "device": "auto",
     "threads": None,

@@ -14,11 +14,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from merl.config import Source, TrainConfig
-from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, suggest
+from merl.core import CONFIG_FILE, LOCK_FILE, METRICS_FILE, MerlError, suggest
 
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
 """Folder of the trained policies that come with merl: run folders without a replay."""
-LOCK_FILE = "lock"
 PART = f".{CONFIG_FILE}.part"
 """Temporary name of `config.json` while it is written."""
 _FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, PART, LOCK_FILE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,27 @@ def test_the_scene_looks_different_and_moves_alike(
     assert np.abs(one["image"].astype(float) - other["image"]).mean() > 5
     plain.close()
     changed.close()
+
+
+@pytest.mark.parametrize(
+    ("start", "occluded", "expected"),
+    [(("above",), False, True), (("above",), True, False), (("around",), False, False)],
+)
+def test_box_tasks_are_occluded_where_the_disc_fits(
+    start: tuple[str, ...], occluded: bool, expected: bool
+) -> None:
+    policy = merl.load_policy("pretrained/reach_duplo")
+    config = policy.config
+    env = dataclasses.replace(config.env, start=start, occluded=occluded)
+    policy.config = dataclasses.replace(config, task="move_box", env=env)
+    found = {each.name: each for each in disturbances(policy, {"proprio": np.ones(2)})}
+    assert ("occluded" in found) is expected
+    if expected:
+        images = [
+            policy.make_env(**form).reset(seed=0)[0]["image"]
+            for form in ({}, found["occluded"].form)
+        ]
+        assert np.abs(images[0].astype(float) - images[1]).mean() > 2
 
 
 def test_the_command_writes_a_table_and_a_figure(

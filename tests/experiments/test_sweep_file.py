@@ -10,6 +10,7 @@ from merl.core import MerlError
 from merl.experiments.experiment import plan
 from merl.experiments.sweep_file import read_experiment
 
+SHIPPED = sorted((Path(__file__).parents[2] / "benchmarks/sweeps").glob("*.toml"))
 WHOLE = """
 title = "Size of the image"
 tasks = ["reach_duplo"]
@@ -40,6 +41,15 @@ def test_a_file_of_variants(tmp_path: Path) -> None:
     assert small.config.agent.encoders == {"proprio": "mlp"}
     assert small.config.env.observations == ("image", "proprio")
     assert camera.config.agent_name == "drqv2"
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_the_files_of_this_project_can_be_run(path: Path, tmp_path: Path) -> None:
+    experiment = read_experiment(path)
+    runs = plan(experiment, preset=experiment.preset or "laptop", seeds=[0], out=tmp_path)
+    assert len(runs) == len(experiment.variants) * 2
+    assert {run.config.steps for run in runs} == {1_000_000}
+    assert all(run.config.evaluated.env.start == ("above",) for run in runs)
 
 
 def test_a_file_with_a_grid(tmp_path: Path) -> None:

@@ -142,6 +142,7 @@ class Policy:
         env: MakeEnv | None = None,
         wrap: Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]] = lambda made: made,
         trust: bool = False,
+        **changes: Any,
     ) -> Evaluation:
         """Run episodes without noise, from the evaluation's fixed start states.
 
@@ -154,6 +155,7 @@ class Policy:
             env: see `make_env`.
             wrap: changes the environment after it was made, e.g. with a wrapper.
             trust: see `make_env`.
+            **changes: see `make_env`.
 
         Raises:
             MerlError: the environment cannot be made or failed, or the video cannot be written.
@@ -161,7 +163,8 @@ class Policy:
         """
         if episodes < 1:
             raise MerlError(f"episodes must be at least 1, not {episodes}")
-        changes: dict[str, Any] = {} if renderer is None else {"renderer": renderer}
+        if renderer is not None:
+            changes["renderer"] = renderer
         if video is not None:
             size = max(self.config.env.render_size, MIN_SIDE)
             changes |= {"render_mode": "rgb_array", "render_size": size}

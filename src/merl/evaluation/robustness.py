@@ -8,7 +8,7 @@ standard deviation in undisturbed episodes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -50,11 +50,13 @@ class Disturbance:
             `none` for the undisturbed policy.
         name: the name within this sense.
         wrap: adds it to an environment.
+        form: fields of `EnvConfig`, for another form of a task of merl.
     """
 
     sense: str
     name: str
-    wrap: Callable[[Env], Env]
+    wrap: Callable[[Env], Env] = lambda env: env
+    form: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,8 @@ def robustness(policy: Policy, episodes: int, *, trust: bool = False) -> Iterato
     )
     scales = {key: np.std(values, axis=0) for key, values in seen.items()}
     for each in disturbances(policy, scales):
-        yield Disturbed(each, policy.evaluate(episodes=episodes, trust=trust, wrap=each.wrap))
+        result = policy.evaluate(episodes=episodes, trust=trust, wrap=each.wrap, **each.form)
+        yield Disturbed(each, result)
 
 
 def disturbances(policy: Policy, scales: Mapping[str, Value]) -> Iterator[Disturbance]:
@@ -128,6 +131,11 @@ def disturbances(policy: Policy, scales: Mapping[str, Value]) -> Iterator[Distur
     if frames and not policy.config.has_user_env:
         yield Disturbance("scene", "darker light", _with_darker_light)
         yield Disturbance("scene", "other floor", _with_other_floor)
+        from merl.tasks import ABOVE, BOX_TASKS  # loads the simulator
+
+        env = policy.config.evaluated.env
+        if policy.config.task in BOX_TASKS and env.start == ABOVE and not env.occluded:
+            yield Disturbance("scene", "occluded", form={"occluded": True})
 
 
 Change = Callable[[Values, np.random.Generator], Value]

@@ -16,6 +16,7 @@ from merl.tasks.move_box import MoveBox
 from merl.tasks.reach_duplo import ReachDuplo
 
 __all__ = [
+    "ABOVE",
     "BOX_TASKS",
     "TASKS",
     "ArmTask",

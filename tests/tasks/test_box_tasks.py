@@ -9,8 +9,9 @@ from merl.core import MerlError
 from merl.rendering.raster.renderer import RasterRenderer
 from merl.tasks import BOX_TASKS, TASKS, arm_task, make_task, rewards
 from merl.tasks.box import AROUND_BOX, BOX_HALF_SIZE, BOX_MASS
-from merl.tasks.expert import GRIP, Expert
+from merl.tasks.expert import make_expert
 from merl.tasks.kinematics import Pose
+from merl.tasks.planner import GRIP, SERVO_GAIN
 
 FORMS = [("move_box", False), ("lift_box", False), ("move_box", True), ("lift_box", True)]
 
@@ -237,10 +238,10 @@ def test_the_hand_can_start_holding_the_box(name):
         physics = episodes.start(seed)
         assert abs(task.prop_position(physics)[2] - BOX_HALF_SIZE) < 3e-3
         assert task.hand_distance(physics) < 0.03
-        arm = Expert(task, physics)
+        arm = make_expert(task, physics)
         goal = Pose(arm.hand.position + np.array([0.0, 0.0, 0.05]), arm.hand.rotation)
         for _ in range(50):
-            physics.set_control(arm.towards(goal, GRIP))
+            physics.set_control(arm.towards(goal, SERVO_GAIN, GRIP))
             physics.step(task.physics_steps_per_control_step)
         follows.append(task.prop_position(physics)[2] - BOX_HALF_SIZE > 0.03)
     assert np.mean(follows) >= 0.8

@@ -5,7 +5,7 @@ import pytest
 
 from episodes import Episodes
 from merl.tasks.arm_task import EPISODE_STEPS
-from merl.tasks.expert import Expert
+from merl.tasks.expert import make_expert
 
 AT_BOX = {"starts": ("around", "holding", "carrying")}
 TASKS = [
@@ -24,7 +24,7 @@ class ExpertEpisodes(Episodes):
 
     def __init__(self, name, **form):
         super().__init__(name, **form)
-        self.expert = Expert(self.task, self.physics)
+        self.expert = make_expert(self.task, self.physics)
         self.low, self.high = self.physics.model.actuator_ctrlrange.T
 
     def start(self, seed):
@@ -32,21 +32,24 @@ class ExpertEpisodes(Episodes):
         self.expert.reset()
         return physics
 
-    def step(self):
+    def step(self, noise=None):
         before = self.physics.get_state()
         velocities = self.expert.act()
         np.testing.assert_array_equal(self.physics.get_state(), before)
         assert velocities.shape == (9,)
         assert (velocities >= self.low).all()
         assert (velocities <= self.high).all()
+        if noise is not None:  # in the units of actions, as exploration noise is
+            velocities = np.clip(velocities + noise * self.high, self.low, self.high)
         self.physics.set_control(velocities)
         self.physics.step(self.task.physics_steps_per_control_step)
         return velocities
 
-    def is_solved(self, seed):
+    def is_solved(self, seed, deviation=0.0):
         self.start(seed)
+        rng = np.random.default_rng(seed)
         for _ in range(EPISODE_STEPS):
-            self.step()
+            self.step(rng.normal(0.0, deviation, 9))
         return self.task.success(self.physics)
 
 
@@ -60,6 +63,32 @@ def test_expert_solves_the_task(name, form):
 def test_expert_solves_95_of_100_starts(name, form):
     episodes = ExpertEpisodes(name, **form)
     assert sum(episodes.is_solved(seed) for seed in range(100)) >= 95
+
+
+@pytest.mark.parametrize(("name", "form"), TASKS[:3])
+def test_expert_recovers_from_noise(name, form):
+    episodes = ExpertEpisodes(name, **form)
+    assert sum(episodes.is_solved(seed, deviation=0.2) for seed in range(5)) >= 4
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("deviation", "least"), [(0.1, 90), (0.2, 80)])
+@pytest.mark.parametrize(("name", "form"), TASKS[:3])
+def test_expert_recovers_from_noise_in_most_of_100_starts(name, form, deviation, least):
+    episodes = ExpertEpisodes(name, **form)
+    assert sum(episodes.is_solved(seed, deviation) for seed in range(100)) >= least
+
+
+@pytest.mark.parametrize("name", ["reach_duplo", "move_box", "lift_box"])
+def test_expert_remembers_nothing(name):
+    episodes = ExpertEpisodes(name)
+    episodes.start(2)
+    for _ in range(70):
+        episodes.step()
+    expected = episodes.expert.act()
+    another = make_expert(episodes.task, episodes.physics)
+    another.reset()
+    np.testing.assert_array_equal(another.act(), expected)
 
 
 def test_expert_repeats_its_velocities_for_the_same_start():

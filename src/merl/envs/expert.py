@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError
 from merl.envs.arm_env import ArmEnv
-from merl.tasks.expert import Expert
+from merl.tasks.expert import make_expert
 
 
 class ExpertPolicy:
@@ -32,7 +32,7 @@ class ExpertPolicy:
                 f"there is no expert for {arm_env}: experts only solve the tasks of merl.tasks"
             )
         self._env = arm_env
-        self._expert = Expert(arm_env.task, arm_env.physics)
+        self._expert = make_expert(arm_env.task, arm_env.physics)
         self._fresh = True
 
     def reset(self) -> None:
@@ -46,7 +46,8 @@ class ExpertPolicy:
             MerlError: the environment is closed.
         """
         if self._expert.physics is not self._env.physics:  # the environment was closed and reset
-            self._expert, self._fresh = Expert(self._env.task, self._env.physics), True
+            self._expert = make_expert(self._env.task, self._env.physics)
+            self._fresh = True
         if self._fresh:
             self._expert.reset()
         self._fresh = False

@@ -1,70 +1,84 @@
 """Scripted experts that read the simulator's state and solve every task.
 
-An expert for a box finds a grasp that the arm can reach without a collision, moves there, closes
-the fingers, carries the box, and finally corrects the error of the box's position. If it loses the
-box, it starts again.
+They remember nothing: each velocity is a function of the state alone, so they recover from noise,
+from a push and from a lost box, and what they do can be imitated. Only the occluded tasks need an
+expert that plans (`merl.tasks.planner`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-
+import mujoco
 import numpy as np
 from dm_control import mjcf
-from dm_control.entities.manipulators.kinova import JacoHand
 
 from merl.core import MerlError
 from merl.tasks.arm_task import ArmTask
-from merl.tasks.grasping import OPEN, TILTS, find_approach, find_carry
-from merl.tasks.kinematics import Array, Kinematics, Path, Pose
+from merl.tasks.box import BOX_HALF_SIZE, BoxTask
+from merl.tasks.controller import Controller
+from merl.tasks.grasping import FINGERS_MIDDLE, OPEN, hand_rotation
+from merl.tasks.kinematics import Array, Pose
 from merl.tasks.lift_box import LiftBox
 from merl.tasks.move_box import MoveBox
+from merl.tasks.planner import Planner
 from merl.tasks.reach_duplo import ReachDuplo
 
-Actions = Iterator[Array]
-"""Joint velocities, (9,), rad/s, one array for each step."""
+ABOVE_BRICK = np.array([0.0, 0.0, 0.04])
+"""Goal of the hand, relative to the brick's origin, which is on the brick's lower face, m."""
+NEAR_BRICK = 0.08
+"""Beyond this distance from its goal the hand moves as fast as the joints can, m."""
+PULL = 60.0
+"""Gain of that motion, from the error along a joint's motion to its velocity, rad/(s m^2)."""
+REACH_GAIN = 8.0
+"""Gain from the error of the hand's position to its velocity, near the brick, 1/s."""
 
-CLOSED = 1.1
-"""Angle at which a box stops the fingers, approximately, rad. They slow down towards it."""
-CLOSING_VELOCITY = 0.6
-"""Minimum velocity commanded to the closing fingers until they stop, rad/s."""
-STOPPED = 0.1
-"""A finger slower than this counts as stopped, rad/s."""
-GRIP = np.array([0.2, 0.1, 0.1])
-"""Velocities commanded to the fingers while they hold the box, rad/s. The first finger presses as
-hard as the other two together."""
-FINGER_GAIN = 8.0
-"""Gain from the error of a finger's angle to its velocity, 1/s."""
-TRACKING_GAIN = 6.0
-"""Gain from the error of a joint on its path to its velocity, 1/s."""
-SERVO_GAIN = 4.0
-"""Gain from the error of the hand's pose to its velocity, 1/s."""
-ARRIVED = 0.015
-"""A joint this close to the end of its path has arrived, rad."""
-SETTLING_STEPS = 12
-"""Maximum number of steps to arrive after the duration of the path."""
-CLOSING_STEPS = range(8, 30)
-"""Minimum and maximum number of steps for the fingers to close."""
-SLIP = 0.03
-"""A box that has moved further than this in the hand is lost, m."""
-BACK_OFF = 0.1
-"""Distance by which the hand retreats from a lost box, m."""
-ABOVE = np.array([0.0, 0.0, 0.04])
-"""Offset above its target from which a box is set down, m."""
-ABOVE_BRICK = np.array([0.0, 0.0, 0.03])
-"""Offset of the hand from the brick's origin, which is on the brick's lower face, m."""
-OVER_PLACE = 0.015
-"""A box this close to the vertical line through its target can be set down, m."""
+SERVO_GAIN = 18.0
+"""Gain from the error of the hand's pose to its velocity, 1/s. The joints take some steps to
+follow: with more the hand swings, with less it drifts under noise."""
+GRASP = np.array([0.0, FINGERS_MIDDLE, 0.0])
+"""Position of the box's centre between the fingers, in the frame of the hand, m."""
+RAISED = np.array([0.0, 0.0, 0.006])
+"""Height of the grasp above that position, m: the fingers stay off the floor."""
+IN_REACH = 0.012
+"""The fingers close if the box is this close to its place between them, m: along and across."""
+GIVE = 0.018
+"""With closing fingers the box may be further away by up to this, m: they move it."""
+ALIGNED = 0.25
+"""They close if the hand is turned to the box's faces with at most this error, rad."""
+CLOSED = 0.9
+"""Angle of the fingers from which they count as closed, rad."""
+CONE_TOP, CONE_SLOPE = 0.09, 4.0
+"""The hand descends to the box in a cone: the height of the goal above the grasp is the slope times
+the horizontal distance, at most the top, m."""
+CENTRED = 0.006
+"""Horizontal distance at which the hand is over the box, m."""
+TURN_LENGTH = 0.03
+"""Weight of one radian of turn, as metres of that distance."""
+FIRM = 2.0
+"""Force of the fingers, on either side of the box, from which it is held, N."""
+LOST = 0.03
+"""A box that is further than this from its place between the fingers is not held, m."""
+CLOSING = np.full(3, 3.0)
+"""Velocities commanded to the fingers that close, rad/s."""
+GRIP = np.array([3.0, 1.5, 1.5])
+"""Velocities commanded to the fingers that hold the box, rad/s. The first finger presses as hard as
+the other two together."""
+BALANCE = 2.0
+"""Gain that keeps both sides of the grip at equal angles, 1/s."""
+CARRIED = 0.03
+"""Height above its target at which a box is carried to it over the floor, m."""
+SET_DOWN = 0.02
+"""A box this close to its target, horizontally, is set down, m."""
+OFF_FLOOR = 0.01
+"""A box moves sideways at full speed once it is raised by this, m."""
+RELEASED, KEPT = 0.004, 0.008
+"""A held box this close to its target on the floor is released, and then left there while it is
+closer than the second distance, m."""
+HOVER = np.array([0.0, 0.0, 0.03])
+"""Height of the hand above the grasp of a box that is in its place, m."""
 
 
-class BoxLostError(Exception):
-    """The fingers do not hold the box, or no free path to it or with it is found."""
-
-
-class Expert:
-    """A deterministic policy that solves a task from the simulator's state.
-
-    Call `reset()` after the start of an episode, then `act()` before each of its steps.
+def make_expert(task: ArmTask, physics: mjcf.Physics) -> Controller:
+    """Return the expert of a task.
 
     Args:
         task: the task to solve.
@@ -73,155 +87,101 @@ class Expert:
     Raises:
         MerlError: the task has no expert.
     """
-
-    def __init__(self, task: ArmTask, physics: mjcf.Physics) -> None:
-        if type(task) not in PLANS or not isinstance(task.robot.hand, JacoHand):
-            raise MerlError(f"task {type(task).__name__} has no scripted expert for its robot")
-        self.task, self.physics = task, physics
-        self.arm = Kinematics(task, physics)
-        self._low, self._high = physics.model.actuator_ctrlrange.T.copy()
-        robot = task.robot
-        self._joints, self._fingers = (
-            physics.bind(robot.arm.joints),
-            physics.bind(robot.hand.joints),
-        )
-        self._actions: Actions = iter(())
-
-    def reset(self) -> None:
-        """Start a new plan, for a new episode."""
-        self._actions = PLANS[type(self.task)](self)
-
-    def act(self) -> Array:
-        """Return the joint velocities for the next step, (9,), rad/s."""
-        velocities: Array = np.clip(next(self._actions), self._low, self._high)
-        return velocities
-
-    @property
-    def q(self) -> Array:
-        """Angles of the arm's joints, (6,), rad."""
-        return np.array(self._joints.qpos)
-
-    @property
-    def fingers(self) -> Array:
-        """Angles of the fingers, (3,), rad."""
-        return np.array(self._fingers.qpos)
-
-    @property
-    def hand(self) -> Pose:
-        """Pose of the pinch site."""
-        return self.arm.pose(self.q)
-
-    @property
-    def box(self) -> Pose:
-        """Pose of the object."""
-        task, physics = self.task, self.physics
-        return Pose(task.prop_position(physics), task.prop_rotation(physics))
-
-    def reach(self) -> Actions:
-        """Move the hand to the object."""
-        rotation = self.hand.rotation
-        while True:
-            yield self.towards(Pose(self.box.position + ABOVE_BRICK, rotation), np.zeros(3))
-
-    def lift(self) -> Actions:
-        """Grasp the box and hold it at its target."""
-        assert isinstance(self.task, LiftBox)
-        assert self.task.target is not None
-        tilts = [tilt for tilt in TILTS if np.cos(tilt) >= self.task.vertical_cosine]
-        while True:
-            try:
-                yield from self._carry(self.task.target, tilts, upright=True)
-                yield from self._hold_at(self.task.target)
-            except BoxLostError:
-                yield from self._back_off()
-
-    def move(self) -> Actions:
-        """Grasp the box, set it down at its target, and keep holding it there."""
-        assert self.task.target is not None
-        while True:
-            try:
-                yield from self._carry(self.task.target + ABOVE, TILTS, upright=False)
-                yield from self._hold_at(self.task.target, from_above=True)
-            except BoxLostError:
-                yield from self._back_off()
-
-    def _carry(self, goal: Array, tilts: Sequence[float], upright: bool) -> Actions:
-        """Grasp the box and bring its centre near `goal`, (3,), m."""
-        self.arm.load(self.physics, OPEN)
-        approach = find_approach(self.arm, self.q, self.box, goal, tilts, upright)
-        if approach is None:
-            raise BoxLostError
-        yield from self._follow(approach, lambda: self._bend(OPEN))
-        yield from self._close(approach[-1])
-        held = self.hand.relative(self.box)
-        self.arm.load(self.physics, self.fingers)
-        path = find_carry(self.arm, self.q, held, goal, upright)
-        if path is None:
-            raise BoxLostError
-        for velocities in self._follow(path, lambda: GRIP):
-            slip = self.hand.relative(self.box).position - held.position
-            if np.linalg.norm(slip) > SLIP:
-                raise BoxLostError
-            yield velocities
-
-    def _hold_at(self, place: Array, from_above: bool = False) -> Actions:
-        """Keep the box in the grip, with its centre at `place`, (3,), m."""
-        rotation, held = self.hand.rotation, self.hand.relative(self.box).position
-        while True:
-            hand, box = self.hand, self.box
-            if np.linalg.norm(hand.relative(box).position - held) > SLIP:
-                raise BoxLostError
-            error = place - box.position
-            if from_above and np.linalg.norm(error[:2]) > OVER_PLACE:
-                error = error + ABOVE
-            yield self.towards(Pose(hand.position + error, rotation), GRIP)
-
-    def _back_off(self) -> Actions:
-        """Open the fingers and retract the hand."""
-        q = self.q
-        back = self.arm.solve(q, self.hand.shifted(-BACK_OFF * self.hand.rotation[:, 2]))
-        yield from self._follow([q], lambda: self._bend(OPEN))
-        yield from self._follow([q, q if back is None else back], lambda: self._bend(OPEN))
-
-    def _close(self, q: Array) -> Actions:
-        """Close the fingers until an object stops them, and keep the arm at `q`."""
-        for step in range(CLOSING_STEPS.stop):
-            velocities = np.array(self._fingers.qvel)
-            if step in CLOSING_STEPS and np.abs(velocities).max() < STOPPED:
-                break
-            fingers = np.maximum(self._bend(np.full(3, CLOSED)), CLOSING_VELOCITY)
-            yield self._limited(TRACKING_GAIN * (q - self.q), fingers)
-
-    def _follow(self, path: Path, fingers: Callable[[], Array]) -> Actions:
-        """Move the arm along a path and let it come to rest."""
-        reference = self.arm.timed(path)
-        forward = np.diff(reference, axis=0, append=reference[-1:]) / self.task.control_timestep
-        for q, velocity in zip(reference, forward, strict=True):
-            yield self._limited(velocity + TRACKING_GAIN * (q - self.q), fingers())
-        for _ in range(SETTLING_STEPS):
-            error = path[-1] - self.q
-            if np.abs(error).max() < ARRIVED:
-                break
-            yield self._limited(TRACKING_GAIN * error, fingers())
-
-    def towards(self, pose: Pose, fingers: Array) -> Array:
-        """Return velocities that move the hand towards a pose."""
-        twist = self.hand.twist_to(pose)
-        return self._limited(self.arm.turn(self.q, SERVO_GAIN * twist), fingers)
-
-    def _limited(self, arm: Array, fingers: Array) -> Array:
-        """Join velocities of arm and fingers; scale those of the arm down to their limits."""
-        excess = np.abs(arm / self.arm.max_velocity).max()
-        return np.concatenate([arm / max(1.0, excess), fingers])
-
-    def _bend(self, angles: Array) -> Array:
-        """Return velocities that move the fingers towards `angles`, (3,), rad."""
-        return FINGER_GAIN * (angles - self.fingers)
+    if isinstance(task, ReachDuplo):
+        return Reacher(task, physics)
+    if isinstance(task, MoveBox | LiftBox):
+        return Planner(task, physics) if task.occluded else Carrier(task, physics)
+    raise MerlError(f"task {type(task).__name__} has no scripted expert for its robot")
 
 
-PLANS: dict[type[ArmTask], Callable[[Expert], Actions]] = {
-    ReachDuplo: Expert.reach,
-    MoveBox: Expert.move,
-    LiftBox: Expert.lift,
-}
-"""The plan of the expert for each task."""
+class Reacher(Controller):
+    """Moves the hand to the object, with any rotation of the hand."""
+
+    def _act(self) -> Array:
+        error = self.box.position + ABOVE_BRICK - self.hand.position
+        jacobian = self.arm.jacobian(self.q)[:3]
+        if np.linalg.norm(error) > NEAR_BRICK:
+            return np.concatenate([PULL * (jacobian.T @ error), np.zeros(3)])
+        return self.limited(self.arm.displaced(self.q, REACH_GAIN * error), np.zeros(3))
+
+
+class Carrier(Controller):
+    """Grasps a box from above and brings it to its target: it holds it there, or sets it down."""
+
+    def __init__(self, task: BoxTask, physics: mjcf.Physics) -> None:
+        super().__init__(task, physics)
+        assert task.target is not None
+        self._target, self._in_air = task.target, isinstance(task, LiftBox)
+        hand, model = task.robot.hand.mjcf_model, physics.model
+        self._finger_of = np.full(model.nbody, -1)
+        for finger in range(3):
+            for part in ("finger", "finger_tip"):
+                body = hand.find("body", f"b_{part}_{finger + 1}")
+                self._finger_of[physics.bind(body).element_id] = finger
+        self._box_body = int(physics.bind(task.prop.mjcf_model.find_all("geom")[0]).bodyid)
+
+    def _act(self) -> Array:
+        hand, box, forces = self.hand, self.box, self._forces()
+        rotation, turn = self._upright(hand, box)
+        grasp = Pose(box.position - rotation @ GRASP + RAISED, rotation)
+        off = hand.relative(box).position - GRASP
+        is_held = min(forces[0], forces[1:].sum()) > FIRM and np.linalg.norm(off) < LOST
+        if not self._in_air and self._distance(box) < (RELEASED if is_held else KEPT):
+            place = hand.position if forces.any() else grasp.position + HOVER
+            return self.towards(Pose(place, rotation), SERVO_GAIN, self.bend(OPEN))
+        if is_held:
+            return self._carry(hand, box)
+        reach = IN_REACH + GIVE * self._closure()
+        if np.linalg.norm(off[:2]) < reach and abs(off[2]) < reach and abs(turn) < ALIGNED:
+            return self.towards(grasp, SERVO_GAIN, CLOSING)
+        away = np.linalg.norm((hand.position - grasp.position)[:2]) + TURN_LENGTH * abs(turn)
+        height = np.clip(CONE_SLOPE * (away - CENTRED), 0.0, CONE_TOP)
+        above = grasp.shifted(np.array([0.0, 0.0, height]))
+        return self.towards(above, SERVO_GAIN, self.bend(OPEN))
+
+    def _carry(self, hand: Pose, box: Pose) -> Array:
+        """Move the held box towards its target."""
+        error = self._target - box.position
+        if not self._in_air:
+            level = np.linalg.norm(error[:2])
+            error[2] += CARRIED * min(1.0, level / SET_DOWN)
+            if level > SET_DOWN:  # it is lifted before it is carried
+                error[:2] *= np.clip((box.position[2] - BOX_HALF_SIZE) / OFF_FLOOR, 0.0, 1.0)
+        angles = self.fingers
+        sides = np.array([angles[0], angles[1:].mean()])
+        balance = BALANCE * (sides.mean() - sides)
+        pose = Pose(hand.position + error, self._upright(hand, hand)[0])
+        return self.towards(pose, SERVO_GAIN, GRIP + balance[[0, 1, 1]])
+
+    def _upright(self, hand: Pose, box: Pose) -> tuple[Array, float]:
+        """Return the nearest rotation of a hand that points down, aligned to a box, and the turn.
+
+        Returns:
+            The rotation, (3, 3), and the angle from the hand's to it, rad, at most pi / 4.
+        """
+        opening, face = hand.rotation[:, 0], box.rotation[:, np.abs(box.rotation[2]).argmin()]
+        now, aligned = (float(np.arctan2(axis[1], axis[0])) for axis in (opening, face))
+        turn = (aligned - now + np.pi / 4) % (np.pi / 2) - np.pi / 4
+        return hand_rotation(now + turn - np.pi / 2, 0.0), turn
+
+    def _closure(self) -> float:
+        """Return by how much the fingers are closed, from 0 (open) to 1."""
+        share = (self.fingers.mean() - OPEN[0]) / (CLOSED - OPEN[0])
+        return float(np.clip(share, 0.0, 1.0))
+
+    def _distance(self, box: Pose) -> float:
+        return float(np.linalg.norm(self._target - box.position))
+
+    def _forces(self) -> Array:
+        """Return the normal force of each finger on the box, (3,), N."""
+        forces, wrench = np.zeros(3), np.zeros(6)
+        model, data = self.physics.model, self.physics.data
+        for index, contact in enumerate(data.contact):
+            bodies = model.geom_bodyid[[contact.geom1, contact.geom2]]
+            if self._box_body not in bodies:
+                continue
+            finger = self._finger_of[bodies].max()
+            if finger >= 0:
+                mujoco.mj_contactForce(model.ptr, data.ptr, index, wrench)
+                forces[finger] += wrench[0]
+        return forces

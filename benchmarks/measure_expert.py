@@ -14,6 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ OCCLUDED = (("move_box", True), ("lift_box", True))
 NOISE = (0.0, 0.1, 0.2)
 
 
-def measure(task: str, occluded: bool, noise: float, episodes: int) -> dict[str, object]:
+def measure(task: str, occluded: bool, noise: float, episodes: int) -> dict[str, Any]:
     """Return the results of the expert of a task with noise."""
     env = make_env(task, occluded=occluded, observations=("state",))
     policy = ExpertPolicy(env)

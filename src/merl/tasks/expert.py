@@ -24,7 +24,7 @@ from merl.tasks.reach_duplo import ReachDuplo
 
 ABOVE_BRICK = np.array([0.0, 0.0, 0.04])
 """Goal of the hand, relative to the brick's origin, which is on the brick's lower face, m."""
-NEAR_BRICK = 0.08
+NEAR_BRICK = 0.03
 """Beyond this distance from its goal the hand moves as fast as the joints can, m."""
 PULL = 60.0
 """Gain of that motion, from the error along a joint's motion to its velocity, rad/(s m^2)."""
@@ -95,14 +95,15 @@ def make_expert(task: ArmTask, physics: mjcf.Physics) -> Controller:
 
 
 class Reacher(Controller):
-    """Moves the hand to the object, with any rotation of the hand."""
+    """Moves the hand to the object: fast, with any rotation, and then with the hand upright."""
 
     def _act(self) -> Array:
-        error = self.box.position + ABOVE_BRICK - self.hand.position
-        jacobian = self.arm.jacobian(self.q)[:3]
+        hand, goal = self.hand, self.box.position + ABOVE_BRICK
+        error = goal - hand.position
         if np.linalg.norm(error) > NEAR_BRICK:
-            return np.concatenate([PULL * (jacobian.T @ error), np.zeros(3)])
-        return self.limited(self.arm.displaced(self.q, REACH_GAIN * error), np.zeros(3))
+            to_velocities = self.arm.jacobian(self.q)[:3].T
+            return np.concatenate([PULL * (to_velocities @ error), np.zeros(3)])
+        return self.towards(Pose(goal, upright(hand, hand)[0]), REACH_GAIN, np.zeros(3))
 
 
 class Carrier(Controller):
@@ -122,7 +123,7 @@ class Carrier(Controller):
 
     def _act(self) -> Array:
         hand, box, forces = self.hand, self.box, self._forces()
-        rotation, turn = self._upright(hand, box)
+        rotation, turn = upright(hand, box)
         grasp = Pose(box.position - rotation @ GRASP + RAISED, rotation)
         off = hand.relative(box).position - GRASP
         is_held = min(forces[0], forces[1:].sum()) > FIRM and np.linalg.norm(off) < LOST
@@ -143,26 +144,15 @@ class Carrier(Controller):
         """Move the held box towards its target."""
         error = self._target - box.position
         if not self._in_air:
-            level = np.linalg.norm(error[:2])
+            level = float(np.linalg.norm(error[:2]))
             error[2] += CARRIED * min(1.0, level / SET_DOWN)
             if level > SET_DOWN:  # it is lifted before it is carried
                 error[:2] *= np.clip((box.position[2] - BOX_HALF_SIZE) / OFF_FLOOR, 0.0, 1.0)
         angles = self.fingers
         sides = np.array([angles[0], angles[1:].mean()])
         balance = BALANCE * (sides.mean() - sides)
-        pose = Pose(hand.position + error, self._upright(hand, hand)[0])
+        pose = Pose(hand.position + error, upright(hand, hand)[0])
         return self.towards(pose, SERVO_GAIN, GRIP + balance[[0, 1, 1]])
-
-    def _upright(self, hand: Pose, box: Pose) -> tuple[Array, float]:
-        """Return the nearest rotation of a hand that points down, aligned to a box, and the turn.
-
-        Returns:
-            The rotation, (3, 3), and the angle from the hand's to it, rad, at most pi / 4.
-        """
-        opening, face = hand.rotation[:, 0], box.rotation[:, np.abs(box.rotation[2]).argmin()]
-        now, aligned = (float(np.arctan2(axis[1], axis[0])) for axis in (opening, face))
-        turn = (aligned - now + np.pi / 4) % (np.pi / 2) - np.pi / 4
-        return hand_rotation(now + turn - np.pi / 2, 0.0), turn
 
     def _closure(self) -> float:
         """Return by how much the fingers are closed, from 0 (open) to 1."""
@@ -185,3 +175,15 @@ class Carrier(Controller):
                 mujoco.mj_contactForce(model.ptr, data.ptr, index, wrench)
                 forces[finger] += wrench[0]
         return forces
+
+
+def upright(hand: Pose, box: Pose) -> tuple[Array, float]:
+    """Return the nearest rotation of a hand that points down, aligned to a box, and the turn.
+
+    Returns:
+        The rotation, (3, 3), and the angle from the hand's to it, rad, at most pi / 4.
+    """
+    opening, face = hand.rotation[:, 0], box.rotation[:, np.abs(box.rotation[2]).argmin()]
+    now, aligned = (float(np.arctan2(axis[1], axis[0])) for axis in (opening, face))
+    turn = (aligned - now + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    return hand_rotation(now + turn - np.pi / 2, 0.0), turn

@@ -146,13 +146,6 @@ class Kinematics:
         self.pose(q)
         return self._turn(twist * (1.0, 1.0, 1.0, LEVER, LEVER, LEVER))
 
-    def displaced(self, q: Array, velocity: Array) -> Array:
-        """Return the joint velocities, (6,), rad/s, for a velocity (3,), m/s, of the hand's point.
-
-        The hand may turn.
-        """
-        return _least_squares(self.jacobian(q)[:3], velocity)
-
     def jacobian(self, q: Array) -> Array:
         """Return the Jacobian of the hand's position and rotation at joint angles `q`, (6, 6)."""
         self.pose(q)
@@ -169,7 +162,9 @@ class Kinematics:
         """Turn from the pose of the copy; the orientation in `twist` is already times `LEVER`."""
         jacobian = self._jacobian()
         jacobian[3:] *= LEVER
-        return _least_squares(jacobian, twist)
+        square = jacobian @ jacobian.T + DAMPING**2 * np.eye(6)
+        result: Array = jacobian.T @ np.linalg.solve(square, twist)
+        return result
 
     def solve(self, q: Array, pose: Pose) -> Array | None:
         """Return the q near the given one for a pose of the hand; None if it is out of reach."""
@@ -263,10 +258,3 @@ class Kinematics:
         kernel = np.ones(SMOOTHING) / SMOOTHING
         padded = [np.pad(angles, SMOOTHING - 1, mode="edge") for angles in joints]
         return np.stack([np.convolve(angles, kernel, mode="valid") for angles in padded], axis=1)
-
-
-def _least_squares(jacobian: Array, twist: Array) -> Array:
-    """Return the turn of the joints for a motion, by damped least squares."""
-    square = jacobian @ jacobian.T + DAMPING**2 * np.eye(len(twist))
-    result: Array = jacobian.T @ np.linalg.solve(square, twist)
-    return result

@@ -37,7 +37,7 @@ class Recorded:
         self._on_gpu = agent.device.type == "cuda"
         self._side = torch.cuda.Stream() if self._on_gpu else None  # type: ignore[no-untyped-call]
         # A graph reads the numbers of its plan from these tensors, which change between updates.
-        self._noise_std, self._step_size = (torch.zeros((), device=agent.device) for _ in range(2))
+        self._plan = UpdatePlan(*(torch.zeros((), device=agent.device) for _ in UpdatePlan._fields))
         self._graph: torch.cuda.CUDAGraph | None = None
         self._names: tuple[str, ...] = ()  # of the metrics
         self._values: Tensor  # the metrics that the graph writes
@@ -48,9 +48,10 @@ class Recorded:
         plan = self._agent.plan(step)
         if not self._on_gpu:
             return self._learn(plan)
-        self._noise_std.fill_(plan.noise_std)
-        self._step_size.fill_(plan.step_size)
-        plan = UpdatePlan(self._noise_std, self._step_size)
+        for kept, value in zip(self._plan, plan, strict=True):
+            assert isinstance(kept, Tensor)
+            kept.fill_(value)
+        plan = self._plan
         self._made += 1
         if self._made <= self.WARM_UP:
             values = self._learn_on_stream(plan)

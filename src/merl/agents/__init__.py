@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from gymnasium import spaces
 
+from merl.agents.bc import BC, BCConfig
 from merl.agents.config import ObservationConfig
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
@@ -29,10 +30,12 @@ class AgentKind:
     Attributes:
         config: its default config.
         make: makes the agent: its class, called with the arguments of `make_agent`.
+        imitates: whether it learns from demonstrations alone.
     """
 
     config: ObservationConfig
     make: Callable[..., Agent]
+    imitates: bool = False
 
 
 AGENTS = {
@@ -43,6 +46,7 @@ AGENTS = {
     # Two baselines of the paper's argument: proprioception alone, and MERL on the state.
     "proprio": AgentKind(MERLConfig(modalities=("vector", "sequence")), DDPG),
     "merl_state": AgentKind(MERLConfig(keys=("state",)), DDPG),
+    "bc": AgentKind(BCConfig(), BC, imitates=True),
 }
 """The agents of merl."""
 METHODS = ("act", "update", "state_dict", "load_state_dict", "load_policy")

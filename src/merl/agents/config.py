@@ -102,6 +102,11 @@ class AgentConfig(ObservationConfig):
     deviation does not change. In updates the noise is uncorrelated."""
     noise_clip: NotNegative = 0.3
     """Bound of the noise in the updates of critic and actor; when acting, noise is not clipped."""
+    clone_weight: NotNegative = 0.0
+    """Weight of a term in the actor's loss that clones the demonstrations (`--replay.demos`): the
+    squared error of its actions, in units of the mean absolute value of the critic."""
+    clone_steps: Annotated[int, Range(1, 10**12)] | None = None
+    """Environment steps over which that weight falls to 0; if not set, it is constant."""
     target: Target = "heads"
     """Networks that have a target copy: the Q-heads (MERL), or the critic's fusion too, as DrQ-v2's
     target includes its trunk."""
@@ -177,6 +182,12 @@ class AgentConfig(ObservationConfig):
         """Return Adam's step size after `step` environment steps."""
         share = step / self.learning_rate_steps
         return _decayed(self.learning_rate, self.learning_rate_end, share)
+
+    def cloning(self, step: int) -> float:
+        """Return the weight of the cloning term after `step` environment steps."""
+        if self.clone_steps is None:
+            return self.clone_weight
+        return _decayed(self.clone_weight, 0.0, step / self.clone_steps)
 
 
 def _decayed(start: float, end: float | None, share: float) -> float:

@@ -127,7 +127,8 @@ class DDPG:
 
     def plan(self, step: int) -> UpdatePlan:
         """Return the values of an update that depend on the step."""
-        return UpdatePlan(self.config.noise(step), self.config.step_size(step))
+        config = self.config
+        return UpdatePlan(config.noise(step), config.step_size(step), config.cloning(step))
 
     @with_torch_settings
     def learn(self, batch: Batch, noise: UpdateNoise, plan: UpdatePlan) -> dict[str, Tensor]:
@@ -143,7 +144,7 @@ class DDPG:
         metrics = self.update_critic(encoded, next_encoded, batch, noise.next_noise)
         # Reuse the features of o_t from before the critic's step, without gradient.
         encoded = {key: features.detach() for key, features in encoded.items()}
-        metrics |= self.update_actor(encoded, noise.actor_noise)
+        metrics |= self.update_actor(encoded, batch, noise.actor_noise, plan)
         if self.config.actor_average is not None:
             self.networks.update_average(self.config.actor_average)
         self.update_target()
@@ -192,11 +193,16 @@ class DDPG:
         q1, q2 = critic.values(latent, action)
         return torch.minimum(q1, q2)
 
-    def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
+    def update_actor(
+        self, encoded: Mapping[str, Tensor], batch: Batch, noise: Tensor, plan: UpdatePlan
+    ) -> dict[str, Tensor]:
         """Move only the actor and its fusion towards actions of higher value (Eq. 2)."""
         with self._arithmetic():
             mean = self.networks.actor(self.networks.actor_latent(encoded))  # (B, A)
-            loss = -self.q(encoded, clamp_straight_through(mean + noise)).mean()
+            q = self.q(encoded, clamp_straight_through(mean + noise))
+            loss = -q.mean()
+        if self.config.clone_weight:
+            loss = loss + plan.clone_weight * q.detach().abs().mean() * cloning_loss(mean, batch)
         step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         return {
             "actor_loss": loss.detach(),
@@ -312,3 +318,9 @@ class DDPG:
         """Return a context with autocast to bf16, enabled if the config chooses bf16."""
         enabled = self.config.precision == "bf16"
         return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled)
+
+
+def cloning_loss(mean: Tensor, batch: Batch) -> Tensor:
+    """Return the squared error of actions (B, A) on the batch's demonstrations, a scalar."""
+    shown = mean[: batch.demos].float()
+    return (shown - batch.action[: batch.demos]).square().mean()

@@ -18,9 +18,9 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from merl.agents.config import Positive
-from merl.agents.ddpg import DDPG, DDPGConfig
+from merl.agents.ddpg import DDPG, DDPGConfig, cloning_loss
 from merl.agents.optimizers import adam, load_optimizer, step_optimizer
-from merl.core import MerlError, UpdatePlan
+from merl.core import Batch, MerlError, UpdatePlan
 from merl.networks.heads import Actor, GaussianActor
 from merl.networks.settings import with_torch_settings
 
@@ -81,13 +81,18 @@ class SAC(DDPG):
         action, log_prob, _ = self._sample(next_encoded, noise)
         return action, -self.log_alpha.exp() * log_prob
 
-    def update_actor(self, encoded: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
+    def update_actor(
+        self, encoded: Mapping[str, Tensor], batch: Batch, noise: Tensor, plan: UpdatePlan
+    ) -> dict[str, Tensor]:
         """Move the actor towards higher soft value, then alpha towards the target entropy."""
         with self._arithmetic():
             action, log_prob, mean = self._sample(encoded, noise)
             q = self.q(encoded, action)
         alpha = self.log_alpha.exp().detach()
         loss = (alpha * log_prob - q).mean()
+        if self.config.clone_weight:
+            cloned = cloning_loss(torch.tanh(mean), batch)
+            loss = loss + plan.clone_weight * q.detach().abs().mean() * cloned
         step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         entropy = -log_prob.detach().mean()
         target = self.config.target_entropy

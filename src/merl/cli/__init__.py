@@ -28,6 +28,7 @@ COMMANDS = {
     "resume": "continue a run that was stopped",
     "evaluate": "run a trained policy, record a video",
     "robustness": "evaluate a policy while its senses are disturbed",
+    "demos": "record demonstrations, from which a run can learn",
     "sweep": "run the experiments of the paper, or your own",
     "report": "draw and compare learning curves",
     "compare": "print what differs between two runs",

@@ -55,6 +55,7 @@ HARMLESS = (
     "eval.max_episode_steps",
     "eval.video",
     "eval.references",
+    "replay.demos",
     "agent.precision",
     "agent.torch_compile",
 )
@@ -94,6 +95,7 @@ class Batch:
             earlier.
         discount: gamma^m, or 0 if the episode terminated; float32 (B,).
         next_observation: o_{t+m}, with the same keys, shapes and types as `observation`.
+        demos: number of samples that come from demonstrations; these are the first ones.
     """
 
     observation: dict[str, Tensor]
@@ -101,6 +103,7 @@ class Batch:
     reward: Tensor
     discount: Tensor
     next_observation: dict[str, Tensor]
+    demos: int = 0
 
     def to(self, device: torch.device) -> Batch:
         """Return the batch on `device`; return `self` if it is already there."""
@@ -112,6 +115,7 @@ class Batch:
             self.reward.to(device),
             self.discount.to(device),
             {key: value.to(device) for key, value in self.next_observation.items()},
+            self.demos,
         )
 
 
@@ -143,6 +147,8 @@ class UpdatePlan(NamedTuple):
     """Standard deviation of the action noise in the update."""
     step_size: float | Tensor
     """Step size of the optimizers."""
+    clone_weight: float | Tensor = 0.0
+    """Weight of the term that clones demonstrations, in the actor's loss."""
 
 
 @runtime_checkable

@@ -183,6 +183,8 @@ def compose(
     config = override(
         config, chosen.for_user_env if config.has_user_env else {"eval.references": True}
     )
+    if name in AGENTS and AGENTS[name].imitates:
+        config = override(config, {"replay.demos_ratio": 1.0})
     values = _agent_values(base, preset, config) if isinstance(base, AgentConfig) else {}
     if setting == "published":
         if name not in PUBLISHED:

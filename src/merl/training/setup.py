@@ -19,7 +19,7 @@ from merl.acting.env_checks import check_instances
 from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
 from merl.acting.workers import WorkerEnvs, check_sendable
-from merl.agents import make_agent
+from merl.agents import AGENTS, make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
 from merl.agents.networks import make_networks, user_encoders
 from merl.config import CUSTOM, Source, TrainConfig
@@ -27,7 +27,8 @@ from merl.core import Agent, MerlError, counted, user_code
 from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.user_env import MakeEnv, load_module
 from merl.evaluation.video import MIN_SIDE
-from merl.replay import ReplaySpec, check_fits
+from merl.replay import ReplayBuffer, ReplaySpec, check_fits
+from merl.runs.demonstrations import Demonstrations
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
 from merl.training.loop import Progress, Randomness
@@ -52,6 +53,7 @@ class Setup:
         action_space: the action space.
         replay_spec: what the replay stores.
         device: device of the networks.
+        demos: the demonstrations; None if the run has none.
         agent: the learner.
         progress: counts of steps, updates and episodes.
         randomness: the random streams of the run.
@@ -79,6 +81,7 @@ class Setup:
         timed = config
         if eval_env is None:
             timed = dataclasses.replace(config, eval=dataclasses.replace(config.eval, video="none"))
+        self.demos, config = load_demos(config, self.space, self.action_space, home)
         self.left_open = left_open(config)
         self.timing = measure(timed, env, eval_env or env, self.space, self.device)
         best = self.timing.best
@@ -190,6 +193,35 @@ def bounded(agent: ObservationConfig, discount: float) -> ObservationConfig:
         )
     high = round(1.0 / (1.0 - discount), 6)  # 100, not 99.99999999999991
     return dataclasses.replace(agent, critic_high=high)
+
+
+def load_demos(
+    config: TrainConfig, space: spaces.Dict, action_space: spaces.Box, home: Path
+) -> tuple[ReplayBuffer | None, TrainConfig]:
+    """Load the demonstrations of a run; return the config with their place and digest.
+
+    Raises:
+        MerlError: they cannot be read, do not fit the run, or are not those that it began with.
+    """
+    replay, agent = config.replay, AGENTS.get(config.agent_name)
+    if replay.demos is None:
+        if agent is not None and agent.imitates:
+            raise MerlError(
+                f"agent {config.agent_name} learns from demonstrations alone: name a folder of "
+                "them with --replay.demos; `merl demos record` makes one"
+            )
+        return None, config
+    found = Demonstrations.open(home / replay.demos)
+    digest = found.digest()
+    if replay.demos_hash not in (None, digest):
+        raise MerlError(
+            f"{found.path} holds other demonstrations than those with which the run began: restore "
+            "them, or name their folder with --replay.demos"
+        )
+    replay = dataclasses.replace(replay, demos=found.path, demos_hash=digest)
+    imitates = agent is not None and agent.imitates
+    loaded = found.load(config.replay, space, action_space, intended=imitates)
+    return loaded, dataclasses.replace(config, replay=replay)
 
 
 def choose_device(name: str) -> torch.device:

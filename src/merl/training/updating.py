@@ -14,6 +14,7 @@ from merl.config import TrainConfig
 from merl.core import Accelerable, Agent
 from merl.networks.settings import torch_settings
 from merl.replay import ReplayBuffer
+from merl.replay.mixing import MixedReplay
 from merl.training.loop import Randomness, Update
 
 ROOM = 0.8
@@ -22,7 +23,7 @@ ROOM = 0.8
 
 def make_update(
     agent: Agent,
-    replay: ReplayBuffer,
+    replay: ReplayBuffer | MixedReplay,
     randomness: Randomness,
     config: TrainConfig,
     device: torch.device,
@@ -36,7 +37,8 @@ def make_update(
 
     Args:
         agent: the learner.
-        replay: the replay, with all steps of the run so far.
+        replay: the replay, with all steps of the run so far, and with the demonstrations if the
+            run has any.
         randomness: the run's random streams.
         config: the config of the run.
         device: device of the agent.
@@ -59,7 +61,7 @@ def make_update(
 
 
 def plain_update(
-    agent: Agent, replay: ReplayBuffer, randomness: Randomness, config: TrainConfig
+    agent: Agent, replay: ReplayBuffer | MixedReplay, randomness: Randomness, config: TrainConfig
 ) -> Update:
     """Return an update that samples a batch and hands it to the agent, for any agent."""
     size, batches = config.replay.batch_size, randomness.batches
@@ -67,7 +69,10 @@ def plain_update(
 
 
 def update_on_cpu(
-    agent: Accelerable, replay: ReplayBuffer, randomness: Randomness, config: TrainConfig
+    agent: Accelerable,
+    replay: ReplayBuffer | MixedReplay,
+    randomness: Randomness,
+    config: TrainConfig,
 ) -> Update:
     """Return the same update, with the random shift applied while images are copied."""
     size, batches = config.replay.batch_size, randomness.batches
@@ -83,7 +88,7 @@ def update_on_cpu(
 
 def update_on_gpu(
     agent: Accelerable,
-    replay: ReplayBuffer,
+    replay: ReplayBuffer | MixedReplay,
     randomness: Randomness,
     config: TrainConfig,
     warn: Callable[[str], None],
@@ -92,7 +97,9 @@ def update_on_gpu(
     """Return a recorded update, with batches from a copy of the replay on the GPU if it fits."""
     torch.cuda.empty_cache()  # return the cached memory of the timed agents
     size = config.replay.batch_size
-    if config.replay.compress:
+    if isinstance(replay, MixedReplay):
+        pass  # each update copies its batch to the GPU
+    elif config.replay.compress:
         warn("the compressed replay stays on the host: each update copies its batch to the GPU")
     elif bytes_on_device(replay) > ROOM * torch.cuda.mem_get_info()[0]:
         warn("the replay does not fit on the GPU: each update copies its batch to the GPU")

@@ -1,0 +1,310 @@
+"""Demonstrations: a folder with recorded episodes, from which runs learn.
+
+demos.json          task, spaces, source, and a line for each episode
+00000.npz, ...      an episode each: observations (T + 1, ...) by key, actions and intended actions
+                    (T, A), rewards (T,)
+
+The observations are stored as the environment returned them, without loss.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from merl.core import MerlError, Transition, counted
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
+from merl.runs.plain import box, describe, told
+
+INDEX = "demos.json"
+FORMAT = 1
+_KEY = "observation/"
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A recorded episode.
+
+    Attributes:
+        observations: {key: (T + 1, ...)}, as the environment returned them.
+        actions: (T, A), float32, in [-1, 1], as they were executed.
+        intended: the actions without the noise that was added to them, in the same form.
+        rewards: (T,), float32.
+        terminated: whether it ended by termination, not by a time limit.
+        success: whether it was solved at its last step; None if the environment does not say.
+    """
+
+    observations: Mapping[str, NDArray[Any]]
+    actions: NDArray[np.float32]
+    intended: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    terminated: bool
+    success: bool | None
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.actions)
+
+
+@dataclass(frozen=True)
+class Line:
+    """What the index says of an episode."""
+
+    file: str
+    steps: int
+    returned: float
+    success: bool | None
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """A folder of demonstrations.
+
+    Attributes:
+        path: the folder.
+        task: the task in which they were recorded.
+        source: who acted, e.g. "expert, noise 0.1".
+        observation_space, action_space: spaces of the environment.
+        lines: the episodes.
+    """
+
+    path: Path
+    task: str
+    source: str
+    observation_space: spaces.Dict
+    action_space: spaces.Box
+    lines: tuple[Line, ...]
+
+    @classmethod
+    def open(cls, path: Path) -> Demonstrations:
+        """Open a folder of demonstrations.
+
+        Raises:
+            MerlError: it is not one, or its index cannot be read.
+        """
+        file = path / INDEX
+        try:
+            found = json.loads(file.read_text())
+            if found["format"] != FORMAT:
+                raise MerlError(
+                    f"{file} has format {found['format']}, and this version reads format {FORMAT}"
+                )
+            observation: dict[str, spaces.Space[Any]] = {
+                key: box(space) for key, space in found["observation_space"].items()
+            }
+            lines = tuple(Line(**line) for line in found["episodes"])
+            return cls(
+                path,
+                str(found["task"]),
+                str(found["source"]),
+                spaces.Dict(observation),
+                box(found["action_space"]),
+                lines,
+            )
+        except FileNotFoundError:
+            raise MerlError(
+                f"{path} holds no demonstrations: it has no {INDEX}; `merl demos record` makes them"
+            ) from None
+        except OSError as error:
+            raise MerlError(f"{file} cannot be read: {error.strerror}") from None
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise MerlError(f"{file} is damaged: {error!r}") from None
+
+    @property
+    def steps(self) -> int:
+        """Number of steps in all episodes."""
+        return sum(line.steps for line in self.lines)
+
+    def episodes(self) -> Iterator[Episode]:
+        """Read the episodes, one after the other.
+
+        Raises:
+            MerlError: a file is missing, damaged, or does not fit the index.
+        """
+        for line in self.lines:
+            yield self._read(line)
+
+    def _read(self, line: Line) -> Episode:
+        file = self.path / Path(line.file).name
+        try:
+            with np.load(file, allow_pickle=False) as arrays:
+                found = {name: arrays[name] for name in arrays.files}
+            observations = {key: found[_KEY + key] for key in self.observation_space}
+            actions, intended, rewards = found["action"], found["intended"], found["reward"]
+            terminated = bool(found["terminated"])
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise MerlError(f"{file} cannot be read: {error}: record it again") from None
+        for key, space in self.observation_space.spaces.items():
+            expected, values = (line.steps + 1, *(space.shape or ())), observations[key]
+            if values.shape != expected or values.dtype != space.dtype:
+                raise MerlError(
+                    f"{file}: observation {key!r} is {values.dtype} {values.shape}, but {INDEX} "
+                    f"says {space.dtype} {expected}"
+                )
+        for each in (actions, intended):
+            if each.shape != (line.steps, *self.action_space.shape):
+                raise MerlError(f"{file}: actions have the shape {each.shape}")
+        numbers = (actions, intended, rewards, *observations.values())
+        if any(each.dtype.kind == "f" and not np.isfinite(each).all() for each in numbers):
+            raise MerlError(f"{file} contains NaN or infinity: remove it from {INDEX}")
+        return Episode(observations, actions, intended, rewards, terminated, line.success)
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the index and of all episodes."""
+        digest = hashlib.sha256((self.path / INDEX).read_bytes())
+        for line in self.lines:
+            try:
+                digest.update((self.path / Path(line.file).name).read_bytes())
+            except OSError as error:
+                raise MerlError(f"{self.path / line.file} cannot be read: {error}") from None
+        return digest.hexdigest()
+
+    def check_fits(self, observation_space: spaces.Dict, action_space: spaces.Box) -> None:
+        """Check that an agent with these spaces can learn from the demonstrations.
+
+        Raises:
+            MerlError: a key is missing or has another shape or type, or the actions differ.
+        """
+        for key, space in observation_space.spaces.items():
+            if key not in self.observation_space.spaces:
+                have = ", ".join(self.observation_space.spaces)
+                raise MerlError(
+                    f"{self.path}: the demonstrations lack observation {key!r}, which the agent "
+                    f"uses: they have {have}"
+                )
+            own, wanted = (told(describe(s)) for s in (self.observation_space[key], space))
+            if own != wanted:
+                raise MerlError(
+                    f"{self.path}: observation {key!r} is {own} in the demonstrations and {wanted} "
+                    "in the environment: record them with the same options"
+                )
+        if self.action_space.shape != action_space.shape:
+            raise MerlError(
+                f"{self.path}: an action has {counted(self.action_space.shape[0], 'number')} in "
+                f"the demonstrations and {action_space.shape[0]} in the environment"
+            )
+
+    def load(
+        self,
+        config: ReplayConfig,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        *,
+        intended: bool = False,
+    ) -> ReplayBuffer:
+        """Return a replay buffer in memory that holds all episodes, with the given keys.
+
+        Args:
+            config: how it is sampled.
+            observation_space: the keys that the agent uses.
+            action_space: the agent's actions.
+            intended: store the intended actions in place of the executed ones, for imitation.
+
+        Raises:
+            MerlError: they do not fit the spaces, are empty, or cannot be read.
+        """
+        self.check_fits(observation_space, action_space)
+        if not self.steps:
+            raise MerlError(f"{self.path} holds no episode")
+        # A slot more for the start of each episode, which may be short.
+        capacity = self.steps + len(self.lines)
+        spec = ReplaySpec.of(config, observation_space, action_space, capacity=capacity)
+        replay = ReplayBuffer(spec)
+        for episode in self.episodes():
+            stored = {key: episode.observations[key] for key in observation_space}
+            actions = episode.intended if intended else episode.actions
+            replay.begin({key: values[0] for key, values in stored.items()})
+            for step in range(len(episode)):
+                last = step == len(episode) - 1
+                replay.add(
+                    Transition(
+                        actions[step],
+                        float(episode.rewards[step]),
+                        0.0 if last and episode.terminated else 1.0,
+                        {key: values[step + 1] for key, values in stored.items()},
+                        last,
+                    )
+                )
+        return replay
+
+
+class Recorder:
+    """Writer of a folder of demonstrations; the folder is complete after every episode.
+
+    Args:
+        path: the folder, which must not exist or be empty.
+        task: the task.
+        source: who acts.
+        observation_space, action_space: spaces of the environment.
+
+    Raises:
+        MerlError: the folder holds files, or cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        task: str,
+        source: str,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+    ) -> None:
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            if any(path.iterdir()):
+                raise MerlError(f"{path} is not empty: name another folder with --out")
+        except OSError as error:
+            raise MerlError(f"{path} cannot be created: {error.strerror}") from None
+        self.demonstrations = Demonstrations(
+            path, task, source, observation_space, action_space, ()
+        )
+
+    def add(self, episode: Episode) -> None:
+        """Write an episode.
+
+        Raises:
+            MerlError: it cannot be written.
+        """
+        demos = self.demonstrations
+        name = f"{len(demos.lines):05}.npz"
+        returned = float(np.sum(episode.rewards, dtype=np.float64))
+        line = Line(name, len(episode), returned, episode.success)
+        whole = Demonstrations(
+            demos.path,
+            demos.task,
+            demos.source,
+            demos.observation_space,
+            demos.action_space,
+            (*demos.lines, line),
+        )
+        arrays: dict[str, Any] = {_KEY + key: v for key, v in episode.observations.items()}
+        arrays |= {"action": episode.actions, "intended": episode.intended}
+        arrays |= {"reward": episode.rewards, "terminated": np.array(episode.terminated)}
+        part = demos.path / f".{INDEX}.part"
+        try:
+            np.savez_compressed(demos.path / name, **arrays)
+            part.write_text(json.dumps(_index(whole), indent=1) + "\n")
+            part.replace(demos.path / INDEX)
+        except OSError as error:
+            raise MerlError(f"{demos.path} cannot be written: {error.strerror}") from None
+        self.demonstrations = whole
+
+
+def _index(demos: Demonstrations) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "task": demos.task,
+        "source": demos.source,
+        "observation_space": {k: describe(s) for k, s in demos.observation_space.items()},
+        "action_space": describe(demos.action_space),
+        "episodes": [asdict(line) for line in demos.lines],
+    }

@@ -1,0 +1,137 @@
+"""merl demos, and runs that learn from demonstrations."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from helpers import flat
+from merl.cli import main
+from merl.runs.demonstrations import Demonstrations
+
+TINY = ["--preset", "smoke", "--agent.keys", "proprio", "--eval.video", "none", "--threads", "1"]
+TINY += ["--eval.every", "500", "--eval.episodes", "1", "--random-steps", "50"]
+TINY += ["--seed-steps", "50", "--agent.precision", "fp32"]
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record two episodes of reach_duplo."""
+    out = tmp_path_factory.mktemp("demos") / "reach"
+    record = ["demos", "record", "reach_duplo", "--preset", "smoke", "--episodes", "2"]
+    assert main([*record, "--out", str(out)]) == 0
+    return out
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return load_file(sorted(run.glob("checkpoints/*"))[-1] / "weights.safetensors")
+
+
+def test_recorded_episodes_are_successes_with_noise(
+    demos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = Demonstrations.open(demos)
+    assert [line.success for line in found.lines] == [True, True]
+    assert list(found.observation_space) == ["image", "proprio", "state"]
+    for episode in found.episodes():
+        assert episode.observations["image"].shape == (251, 32, 32, 3)
+        noise = episode.actions - episode.intended
+        within = np.abs(episode.actions) < 1  # others are clipped
+        assert 0.08 < noise[within].std() < 0.12
+    assert main(["demos", "show", str(demos)]) == 0
+    shown = flat(capsys.readouterr().out)
+    assert "2 episodes of reach_duplo by expert, noise 0.1" in shown
+    assert "success at the end in 2 of 2" in shown
+
+
+@pytest.mark.parametrize("agent", ["merl", "sac", "bc"])
+def test_a_run_learns_from_demonstrations_and_resumes_exactly(
+    agent: str, demos: Path, tmp_path: Path
+) -> None:
+    train = ["train", "reach_duplo", "--agent", agent, *TINY, "--replay.demos", str(demos)]
+    clone = [] if agent == "bc" else ["--agent.clone-weight", "0.5", "--agent.clone-steps", "400"]
+    runs = {name: tmp_path / name for name in ("whole", "halves", "without")}
+    assert main([*train, *clone, "--steps", "500", "--run-dir", str(runs["whole"])]) == 0
+    assert main([*train, *clone, "--steps", "250", "--run-dir", str(runs["halves"])]) == 0
+    resume = [*train, *clone, "--steps", "500", "--run-dir", str(runs["halves"]), "--resume"]
+    assert main(resume) == 0
+    whole, halves = weights(runs["whole"]), weights(runs["halves"])
+    for name, value in whole.items():
+        torch.testing.assert_close(halves[name], value, rtol=0, atol=0)
+    config = json.loads((runs["whole"] / "config.json").read_text())["config"]["replay"]
+    assert config["demos"] == str(demos)
+    assert config["demos_hash"] == Demonstrations.open(demos).digest()
+    assert config["demos_ratio"] == (1.0 if agent == "bc" else 0.5)
+    if agent == "merl":
+        other = [*train, "--steps", "500", "--run-dir", str(runs["without"])]
+        assert main(other) == 0
+        changed = weights(runs["without"])
+        assert any(not torch.equal(changed[name], value) for name, value in whole.items())
+
+
+def test_other_demonstrations_are_refused_on_resume(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy, run = tmp_path / "copy", tmp_path / "run"
+    shutil.copytree(demos, copy)
+    train = ["train", "reach_duplo", *TINY, "--replay.demos", str(copy), "--run-dir", str(run)]
+    assert main([*train, "--steps", "250"]) == 0
+    moved = tmp_path / "moved"
+    copy.rename(moved)
+    assert main(["resume", str(run), "--steps", "300"]) == 2
+    assert "copy holds no demonstrations" in capsys.readouterr().err
+    again = ["train", "reach_duplo", *TINY, "--replay.demos", str(moved), "--run-dir", str(run)]
+    assert main([*again, "--steps", "300", "--resume"]) == 0
+    file = moved / "00000.npz"
+    file.write_bytes(file.read_bytes() + b" ")
+    assert main([*again, "--steps", "400", "--resume"]) == 2
+    error = capsys.readouterr().err
+    assert "holds other demonstrations than those with which the run began" in error
+
+
+def test_a_policy_can_demonstrate(tmp_path: Path) -> None:
+    record = ["demos", "record", "reach_duplo", "--from", "pretrained/reach_duplo"]
+    record += ["--preset", "laptop", "--noise", "0", "--episodes", "1", "--failures"]
+    assert main([*record, "--out", str(tmp_path / "out")]) == 0
+    (episode,) = Demonstrations.open(tmp_path / "out").episodes()
+    np.testing.assert_array_equal(episode.actions, episode.intended)
+    assert episode.rewards.sum() > 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["demos", "recrod"], "merl demos 'recrod' is unknown: did you mean 'record'"),
+        (["demos", "record", "reach"], "task 'reach' is unknown"),
+        (["demos", "record", "reach_duplo", "--noise", "2"], "--noise must be at least 0"),
+        (["demos", "show", "nowhere"], "nowhere holds no demonstrations"),
+        (["train", "reach_duplo", *TINY, "--agent", "bc"], "learns from demonstrations alone"),
+        (
+            ["train", "reach_duplo", *TINY, "--replay.demos", "nowhere"],
+            "nowhere holds no demonstrations",
+        ),
+        (
+            ["train", "reach_duplo", *TINY, "--replay.demos-ratio", "1.5"],
+            "replay.demos-ratio must be above 0 and at most 1",
+        ),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not any(tmp_path.iterdir())

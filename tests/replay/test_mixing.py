@@ -1,0 +1,73 @@
+"""Batches of which a part comes from demonstrations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from merl.core import Transition
+from merl.networks.augmentation import RandomShift, shift
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
+from merl.replay.mixing import MixedReplay
+
+OBSERVATION = spaces.Dict(
+    {
+        "image": spaces.Box(0, 255, (8, 8, 3), np.uint8),
+        "joint": spaces.Box(-np.inf, np.inf, (2,), np.float32),
+    }
+)
+ACTION = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+def replay_of(value: float, steps: int = 30) -> ReplayBuffer:
+    """Return a replay whose actions are all `value`, with random images."""
+    spec = ReplaySpec.of(
+        ReplayConfig(batch_size=4, frame_stack=2), OBSERVATION, ACTION, capacity=99
+    )
+    replay, rng = ReplayBuffer(spec), np.random.default_rng(int(100 * value))
+
+    def observe() -> dict[str, np.ndarray]:
+        image = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+        return {"image": image, "joint": np.full(2, value, np.float32)}
+
+    replay.begin(observe())
+    for step in range(steps):
+        action = np.full(1, value, np.float32)
+        replay.add(Transition(action, value, 1.0, observe(), step == steps - 1))
+    return replay
+
+
+@pytest.mark.parametrize(("ratio", "count"), [(0.5, 8), (0.25, 4), (1.0, 16), (0.001, 1)])
+def test_the_first_samples_are_demonstrations(ratio: float, count: int) -> None:
+    mixed = MixedReplay(replay_of(0.1), replay_of(0.7), ratio)
+    batch = mixed.sample(16, np.random.default_rng(0))
+    assert batch.demos == count
+    expected = torch.full((16, 1), 0.1)
+    expected[:count] = 0.7
+    torch.testing.assert_close(batch.action, expected)
+    torch.testing.assert_close(batch.observation["joint"], expected.expand(16, 2))
+    assert batch.to(torch.device("cpu")).demos == count
+    assert batch.to(torch.device("meta")).demos == count
+
+
+def test_random_shifts_belong_to_their_samples() -> None:
+    own, demos = replay_of(0.1), replay_of(0.7)
+    shifts = torch.randint(0, 5, (10, 2), generator=torch.Generator().manual_seed(0))
+    plain = MixedReplay(own, demos, 0.3).sample(10, np.random.default_rng(3))
+    transform = {"image": RandomShift(shifts, 2)}
+    shifted = MixedReplay(own, demos, 0.3).sample(
+        10, np.random.default_rng(3), transform, transform
+    )
+    for before, after in (
+        (plain.observation, shifted.observation),
+        (plain.next_observation, shifted.next_observation),
+    ):
+        torch.testing.assert_close(after["image"], shift(before["image"], shifts, 2))
+
+
+def test_equal_generators_give_equal_batches() -> None:
+    mixed = MixedReplay(replay_of(0.1), replay_of(0.7), 0.5)
+    first, second = (mixed.sample(8, np.random.default_rng(5)) for _ in range(2))
+    torch.testing.assert_close(first.observation, second.observation)

@@ -1,0 +1,166 @@
+"""Demonstrations are stored without loss, checked when they are read, and fill a replay."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from merl.core import MerlError
+from merl.replay import ReplayConfig
+from merl.runs.demonstrations import Demonstrations, Episode, Recorder
+
+OBSERVATION = spaces.Dict(
+    {
+        "image": spaces.Box(0, 255, (8, 8, 3), np.uint8),
+        "joint": spaces.Box(-np.inf, np.inf, (2,), np.float32),
+    }
+)
+ACTION = spaces.Box(-1.0, 1.0, (3,), np.float32)
+CONFIG = ReplayConfig(batch_size=4, n_step=3, frame_stack=2, discount=0.9)
+
+
+def episode(steps: int, seed: int = 0, terminated: bool = False) -> Episode:
+    rng = np.random.default_rng(seed)
+    return Episode(
+        {
+            "image": rng.integers(0, 256, (steps + 1, 8, 8, 3), dtype=np.uint8),
+            "joint": rng.normal(size=(steps + 1, 2)).astype(np.float32),
+        },
+        rng.uniform(-1, 1, (steps, 3)).astype(np.float32),
+        rng.uniform(-1, 1, (steps, 3)).astype(np.float32),
+        rng.uniform(size=steps).astype(np.float32),
+        terminated,
+        True,
+    )
+
+
+@pytest.fixture
+def demos(tmp_path: Path) -> Demonstrations:
+    recorder = Recorder(tmp_path / "demos", "move_box", "expert", OBSERVATION, ACTION)
+    for seed, steps in enumerate((7, 1, 5)):
+        recorder.add(episode(steps, seed, terminated=seed == 2))
+    return recorder.demonstrations
+
+
+def test_episodes_are_read_as_they_were_written(demos: Demonstrations) -> None:
+    opened = Demonstrations.open(demos.path)
+    assert opened == demos
+    assert opened.steps == 13
+    for seed, found in enumerate(opened.episodes()):
+        written = episode(len(found), seed)
+        np.testing.assert_equal(found.observations, written.observations)
+        np.testing.assert_array_equal(found.actions, written.actions)
+        np.testing.assert_array_equal(found.intended, written.intended)
+        np.testing.assert_array_equal(found.rewards, written.rewards)
+    assert [line.returned for line in opened.lines] == pytest.approx(
+        [float(one.rewards.sum()) for one in opened.episodes()]
+    )
+
+
+@pytest.mark.parametrize("intended", [False, True])
+def test_a_replay_holds_every_step(demos: Demonstrations, intended: bool) -> None:
+    replay = demos.load(CONFIG, OBSERVATION, ACTION, intended=intended)
+    assert len(replay) == demos.steps
+    batch = replay.sample(400, np.random.default_rng(0))
+    actions = {tuple(action) for action in batch.action.numpy().tolist()}
+    episodes = [*demos.episodes()]
+    expected = [one.intended if intended else one.actions for one in episodes]
+    assert actions == {tuple(action) for each in expected for action in each.tolist()}
+    discounts = {round(float(d), 4) for d in batch.discount}
+    # 0.9^3, shorter before a time limit, and 0 where the last episode terminated
+    assert discounts == {0.729, 0.81, 0.9, 0.0}
+
+
+def test_keys_that_the_agent_does_not_use_are_left_out(demos: Demonstrations) -> None:
+    joint = spaces.Dict({"joint": OBSERVATION["joint"]})
+    batch = demos.load(CONFIG, joint, ACTION).sample(2, np.random.default_rng(0))
+    assert list(batch.observation) == ["joint"]
+
+
+def test_the_digest_changes_with_any_byte(demos: Demonstrations) -> None:
+    before = demos.digest()
+    assert Demonstrations.open(demos.path).digest() == before
+    file = demos.path / "00001.npz"
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    assert demos.digest() != before
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ({"force": spaces.Box(-1, 1, (6,), np.float32)}, "lack observation 'force'"),
+        ({"image": spaces.Box(0, 255, (9, 9, 3), np.uint8)}, r"is uint8 \(8, 8, 3\) from 0 to 255"),
+        ({"joint": spaces.Box(-1, 1, (3,), np.float32)}, r"float32 \(3,\) in the environment"),
+    ],
+)
+def test_demonstrations_that_do_not_fit_are_refused(
+    demos: Demonstrations, space: dict[str, spaces.Box], message: str
+) -> None:
+    with pytest.raises(MerlError, match=message):
+        demos.load(CONFIG, spaces.Dict(space), ACTION)
+    with pytest.raises(MerlError, match="3 numbers in the demonstrations and 2 in the"):
+        demos.load(CONFIG, OBSERVATION, spaces.Box(-1, 1, (2,), np.float32))
+
+
+def damage(folder: Path, how: str) -> None:
+    file, index = folder / "00001.npz", folder / "demos.json"
+    content = json.loads(index.read_text())
+    match how:
+        case "truncated":
+            file.write_bytes(file.read_bytes()[:-200])
+        case "missing":
+            file.unlink()
+        case "not an archive":
+            file.write_bytes(b"text")
+        case "NaN":
+            arrays = dict(np.load(file))
+            arrays["reward"][0] = np.nan
+            np.savez_compressed(file, **arrays)
+        case "length":
+            content["episodes"][1]["steps"] = 4
+        case "key":
+            del content["episodes"][1]["file"]
+        case "format":
+            content["format"] = 9
+        case "folder outside":
+            content["episodes"][1]["file"] = "../../secret.npz"
+        case "empty":
+            content["episodes"] = []
+    index.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("truncated", "00001.npz cannot be read"),
+        ("missing", "00001.npz cannot be read"),
+        ("not an archive", "00001.npz cannot be read"),
+        ("NaN", "00001.npz contains NaN or infinity"),
+        ("length", "observation 'image' is uint8"),
+        ("key", "demos.json is damaged"),
+        ("format", "has format 9, and this version reads format 1"),
+        ("folder outside", "demos/secret.npz cannot be read"),
+        ("empty", "holds no episode"),
+    ],
+)
+def test_damage_is_named_in_one_line(demos: Demonstrations, how: str, message: str) -> None:
+    damage(demos.path, how)
+    with pytest.raises(MerlError, match=message) as caught:
+        Demonstrations.open(demos.path).load(CONFIG, OBSERVATION, ACTION)
+    assert "\n" not in str(caught.value)
+
+
+def test_folders_that_are_not_demonstrations(tmp_path: Path, demos: Demonstrations) -> None:
+    with pytest.raises(MerlError, match="holds no demonstrations"):
+        Demonstrations.open(tmp_path)
+    with pytest.raises(MerlError, match="is not empty: name another folder"):
+        Recorder(demos.path, "a", "b", OBSERVATION, ACTION)
+    (tmp_path / "file").touch()
+    with pytest.raises(MerlError, match="cannot be created"):
+        Recorder(tmp_path / "file", "a", "b", OBSERVATION, ACTION)

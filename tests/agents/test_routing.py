@@ -47,7 +47,7 @@ def update_actor(agent: DDPG, *, detached: bool = True) -> None:
     encoded = agent.networks.encoders(batch.observation, draws.shifts)
     if detached:
         encoded = {key: features.detach() for key, features in encoded.items()}
-    agent.update_actor(encoded, draws.actor_noise)
+    agent.update_actor(encoded, batch, draws.actor_noise, agent.plan(0))
 
 
 def same(before: list, after: list) -> bool:

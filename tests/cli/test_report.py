@@ -28,7 +28,7 @@ def test_a_report_of_a_folder_of_runs(runs: Path, capsys: pytest.CaptureFixture[
     assert main(["report", str(runs), "--out", str(out)]) == 0
     shown = capsys.readouterr().out
     assert f"{out}/index.html: 3 runs, 2 curves" in shown
-    assert "fast lacks seed 1" in shown
+    assert "fast has one seed" in shown
     assert (out / "index.html").read_text().count("<svg") == 5
     assert main(["report", str(runs / "reach_duplo-merl-s0"), "--out", str(out)]) == 0
 

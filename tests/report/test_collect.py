@@ -20,10 +20,16 @@ def test_runs_that_differ_in_their_seed_are_one_group(tmp_path: Path) -> None:
     write_run(tmp_path / "reach_duplo-wide-s2", UP, RATES, seed=2, latent_dim=256)
     groups, notes = collect([tmp_path])
     assert [(group.label, group.seeds) for group in groups] == [("merl", [2, 10]), ("wide", [2])]
-    assert notes == [
-        "reach_duplo: wide lacks seed 10, which others have",
-        "reach_duplo: wide has one seed: no interval over seeds",
-    ]
+    assert notes == ["reach_duplo: wide has one seed: no interval over seeds"]
+
+
+def test_missing_seeds_are_named(tmp_path: Path) -> None:
+    for seed in (0, 1, 2):
+        write_run(tmp_path / f"reach_duplo-merl-s{seed}", UP, RATES, seed=seed)
+        if seed != 1:
+            write_run(tmp_path / f"reach_duplo-wide-s{seed}", UP, RATES, seed=seed, tau=0.1)
+    _, notes = collect([tmp_path])
+    assert notes == ["reach_duplo: wide lacks seed 1, which others have"]
 
 
 def test_options_that_change_no_learning_do_not_split_a_group(tmp_path: Path) -> None:

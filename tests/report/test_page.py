@@ -63,7 +63,7 @@ def test_figures_are_files_too(report: Path) -> None:
             assert Image.open(report / f"reach_duplo-{name}-{x}.png").width > 1000
             svg = (report / f"reach_duplo-{name}-{x}.svg").read_text()
             assert "merl (2 seeds)" in svg
-    assert "scripted expert 219" in (report / "reach_duplo-return-steps.svg").read_text()
+    assert "scripted expert 230" in (report / "reach_duplo-return-steps.svg").read_text()
     assert {path.suffix for path in report.iterdir()} == {".html", ".csv", ".png", ".svg", ".jpg"}
 
 

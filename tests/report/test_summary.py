@@ -71,7 +71,7 @@ def test_single_seeds_are_compared_without_an_interval(tmp_path: Path) -> None:
 
 def test_scores_are_0_for_random_actions_and_1_for_the_expert(tmp_path: Path) -> None:
     for seed in (0, 1):
-        write_run(tmp_path / f"reach_duplo-a-s{seed}", [7.8 + seed * 211.6], [0], seed=seed)
+        write_run(tmp_path / f"reach_duplo-a-s{seed}", [7.8 + seed * 221.8], [0], seed=seed)
     (found,) = overall(groups_of(tmp_path))
     assert found.scores[:, 0] == pytest.approx([0, 1], abs=0.01)
     assert found.mean.mean == pytest.approx(0.5, abs=0.01)

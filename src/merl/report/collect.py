@@ -248,7 +248,9 @@ def _about_seeds(groups: Sequence[Group]) -> Iterator[str]:
         every = sorted({seed for group in its for seed in group.seeds if seed is not None})
         for group in its:
             missing = [str(seed) for seed in every if seed not in group.seeds]
-            if missing and None not in group.seeds:
+            if len(group.runs) == 1:
+                yield f"{task}: {group.label} has one seed: no interval over seeds"
+            elif missing and None not in group.seeds:
                 yield f"{task}: {group.label} lacks seed {', '.join(missing)}, which others have"
             ends = {int(run.curve(RETURN).steps[-1]) for run in group.runs}
             if len(ends) > 1:
@@ -256,8 +258,6 @@ def _about_seeds(groups: Sequence[Group]) -> Iterator[str]:
                     f"{task}: the seeds of {group.label} are of unequal length: their mean ends at "
                     f"step {min(ends):,}, where the shortest ends"
                 )
-            if len(group.runs) == 1:
-                yield f"{task}: {group.label} has one seed: no interval over seeds"
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -37,7 +37,7 @@ MOST_VIDEO = 40_000_000
 RESULTS = {
     "final return": ("final return", ".3g", ""),
     "best return": ("best return", ".3g", ""),
-    "mean return over training": ("area", ".3g", ""),
+    "mean return": ("area", ".3g", ""),
     "final success": ("final success", ".0f", " %"),
     "best success": ("best success", ".0f", " %"),
     **{
@@ -143,7 +143,7 @@ def _results(rows: Sequence[Row]) -> str:
     for heading, (name, form, unit) in RESULTS.items():
         if any(name in row.results for row in rows):
             columns[heading] = _result(name, form, unit)
-    columns["spread of the final return over seeds"] = lambda row: number_cell(row.spread)
+    columns["spread"] = lambda row: number_cell(row.spread)
     return table(columns, rows)
 
 

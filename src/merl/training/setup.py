@@ -28,6 +28,7 @@ from merl.core.resources import available_memory, keep_freed_memory
 from merl.envs.user_env import MakeEnv, load_module
 from merl.evaluation.video import MIN_SIDE
 from merl.replay import ReplayBuffer, ReplaySpec, check_fits
+from merl.replay.mixing import MixedReplay
 from merl.runs.demonstrations import Demonstrations
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
@@ -110,6 +111,12 @@ class Setup:
         if self.config.has_workers:
             return WorkerEnvs(self.config, self.env, self.make)
         return InProcessEnvs(self.env)
+
+    def batches_from(self, replay: ReplayBuffer) -> ReplayBuffer | MixedReplay:
+        """Return the source of batches: the run's replay, with its demonstrations if it has any."""
+        if self.demos is None:
+            return replay
+        return MixedReplay(replay, self.demos, self.config.replay.demos_ratio)
 
     @classmethod
     @contextmanager

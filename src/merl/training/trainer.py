@@ -20,7 +20,6 @@ from merl.envs.user_env import MakeEnv
 from merl.loggers import CSV, make_loggers
 from merl.networks.settings import torch_settings
 from merl.replay import ReplayBuffer
-from merl.replay.mixing import MixedReplay
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
@@ -262,11 +261,9 @@ class Trainer:
             FrameStack(setup.spec.modalities, setup.spec.frame_stack, setup.device)
             for _ in range(self._environments.count)
         ]
-        demos = setup.demos
-        ratio = self.config.replay.demos_ratio
         update = make_update(
             setup.agent,
-            self.replay if demos is None else MixedReplay(self.replay, demos, ratio),
+            setup.batches_from(self.replay),
             setup.randomness,
             self.config,
             setup.device,

@@ -26,7 +26,7 @@ ALLOWED_SKIPS = (
     r"no Chromium on this machine",
     r"timm is not installed",
     r"this system does not allow users to mount a disk",
-    r"could not import '(tensorboard|wandb|trackio|nbclient|ipykernel)",
+    r"could not import '(tensorboard|wandb|trackio|nbclient|ipykernel|onnxruntime)",
 )
 """Regular expressions of the allowed reasons to skip a test; any other skip is a failure."""
 

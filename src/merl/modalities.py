@@ -167,6 +167,8 @@ class Image(Frames):
         """
         import torch
 
+        if torch.compiler.is_exporting():  # bytes as signed integers are no operation of ONNX
+            return super().centred(stacks, dtype)
         pixels = _minus_128(stacks).view(torch.int8).flatten(3).to(dtype)
         if self.middle != 128:
             pixels = pixels + (128 - self.middle)

@@ -62,7 +62,7 @@ class Networks(nn.Module):
     @property
     def senses(self) -> tuple[str, ...]:
         """Observation keys that the actor uses."""
-        return self._fusion_of_actor().keys
+        return self.fusion_of_actor().keys
 
     def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
         """Return the actions (B, A) without noise, in [-1, 1]: the policy that is deployed.
@@ -87,12 +87,12 @@ class Networks(nn.Module):
 
     def actor_latent(self, encoded: Mapping[str, Tensor]) -> Tensor:
         """Fuse the encodings for the actor."""
-        latent: Tensor = self._fusion_of_actor()(encoded)
+        latent: Tensor = self.fusion_of_actor()(encoded)
         return latent
 
     def start_average(self) -> None:
         """Start the moving average of the actor and its fusion, as a copy of them."""
-        recent = nn.ModuleDict({"fusion": self._fusion_of_actor(), "actor": self.actor})
+        recent = nn.ModuleDict({"fusion": self.fusion_of_actor(), "actor": self.actor})
         self.policy_average = copy.deepcopy(recent).requires_grad_(False)
 
     @torch.no_grad()
@@ -100,10 +100,11 @@ class Networks(nn.Module):
         """Update the moving average with weight `tau` for the newest weights."""
         assert self.policy_average is not None
         average: list[Tensor] = list(self.policy_average.parameters())
-        recent: list[Tensor] = [*self._fusion_of_actor().parameters(), *self.actor.parameters()]
+        recent: list[Tensor] = [*self.fusion_of_actor().parameters(), *self.actor.parameters()]
         torch._foreach_lerp_(average, recent, tau)
 
-    def _fusion_of_actor(self) -> Fusion | Concatenation:
+    def fusion_of_actor(self) -> Fusion | Concatenation:
+        """Return the fusion that the actor uses: its own, or the critic's."""
         return self.critic_fusion if self.actor_fusion is None else self.actor_fusion
 
 

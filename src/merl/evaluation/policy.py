@@ -41,6 +41,7 @@ class Policy:
         config: the config of its run.
         modalities: the modality of each key that the policy uses.
         step: environment steps at which the policy was saved.
+        run: its run; None for a policy without a folder.
         reports_success: whether the environment was known to report success at that step.
     """
 
@@ -54,7 +55,7 @@ class Policy:
         run: Run | None = None,
         reports_success: bool = False,
     ) -> None:
-        self.config, self.step, self._run = config, step, run
+        self.config, self.step, self.run = config, step, run
         self.reports_success = reports_success
         self.agent = agent
         known = modalities_of(space)
@@ -121,12 +122,12 @@ class Policy:
                 renderer,
             )
             changes.setdefault("samples", 1)  # the recorded value is for that renderer
-        if self._run is not None and env is None:
-            self._run.load_module(trusted=trust)
+        if self.run is not None and env is None:
+            self.run.load_module(trusted=trust)
         made = make_run_env(self.config.evaluated, env, **changes)
-        if self._run is not None and self.config.has_user_env:
+        if self.run is not None and self.config.has_user_env:
             try:
-                self._run.check_environment(*run_spaces(self.config, made), own_bounds(made))
+                self.run.check_environment(*run_spaces(self.config, made), own_bounds(made))
             except BaseException:
                 made.close()
                 raise

@@ -1,0 +1,56 @@
+"""The command merl export."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.filesize import decimal
+
+from merl.cli.output import make_console
+from merl.cli.parsing import RunOptions, check_writable, parse
+from merl.cli.running import tell_trusted
+from merl.evaluation.export import SUFFIXES, Form, export_policy
+from merl.evaluation.policy import load_policy
+from merl.runs.run import Run
+
+
+@dataclass(frozen=True)
+class ExportOptions(RunOptions):
+    """Write a trained policy to one file that runs without merl."""
+
+    to: Form = "onnx"
+    """onnx, for ONNX Runtime and others, or torch, a program of torch.export."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """The file; by default policy.onnx or policy.pt2. A card in JSON is written beside it."""
+    checkpoint: str = "latest"
+    """latest, best (the highest evaluation return), or the step of a checkpoint."""
+
+
+def export(args: list[str]) -> int:
+    """Export a policy: merl export RUN [--to onnx|torch] [--out FILE]."""
+    options = parse(ExportOptions, "merl export", args)
+    out = (options.out or Path(f"policy{SUFFIXES[options.to]}")).absolute()
+    if out.suffix != SUFFIXES[options.to]:
+        out = out.with_name(out.name + SUFFIXES[options.to])
+    check_writable(out)
+    console = make_console()
+    if options.trust:
+        tell_trusted(Run.open(options.run))
+    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    with console.status("exporting", spinner="line"):
+        card = export_policy(policy, out, options.to)
+    size, times = decimal(out.stat().st_size), card["milliseconds"]
+    console.print(
+        f"{out}: {size}; an action takes {times['p50']} ms (99 %: {times['p99']} ms) on one thread",
+        highlight=False,
+        soft_wrap=True,
+    )
+    for kind in ("inputs", "outputs"):
+        for name, told in card[kind].items():
+            shape = tuple(told["shape"])
+            console.print(f"  {kind[:-1]} {name}: {told['dtype']} {shape}", highlight=False)
+    console.print(f"card: {out}.json", highlight=False, soft_wrap=True)
+    return 0

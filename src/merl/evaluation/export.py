@@ -1,0 +1,237 @@
+"""Export a policy to one file that needs no merl: ONNX, or a program of torch.export.
+
+The exported function remembers nothing. Its inputs are one observation (each key that the policy
+uses) and, for each camera, the former frames; its outputs are the action in the environment's own
+units and the frames to pass with the next observation. At the start of an episode the former frames
+are copies of the first one.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+import merl
+from merl.agents.ddpg import DDPG
+from merl.core import MerlError, check_choice
+from merl.evaluation.policy import Policy
+from merl.runs import record
+
+Form = Literal["onnx", "torch"]
+SUFFIXES: dict[Form, str] = {"onnx": ".onnx", "torch": ".pt2"}
+FORMER = "_former"
+"""Ending of the inputs with the former frames of a camera."""
+NEXT = "_next"
+"""Ending of the outputs with the former frames for the next step."""
+CALLS = 200
+"""Calls of the latency's measurement."""
+
+Values = Mapping[str, NDArray[Any]]
+Run = Callable[[Values], dict[str, NDArray[Any]]]
+"""The exported function: from inputs by name to outputs by name."""
+
+
+class Deployed(nn.Module):
+    """The policy of one observation, as it is exported.
+
+    Args:
+        policy: the policy of one of merl's agents.
+        bounds: lower and upper bounds of the environment's actions; None if they are [-1, 1].
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, policy: Policy, bounds: tuple[list[float], list[float]] | None) -> None:
+        super().__init__()
+        agent = policy.agent
+        if not isinstance(agent, DDPG):
+            raise MerlError(
+                "only the policies of merl's own agents can be exported: export yours with torch"
+            )
+        networks = agent.networks.cpu().eval()
+        average = networks.policy_average
+        self.encoders = networks.encoders
+        self.fusion = networks.fusion_of_actor() if average is None else average["fusion"]
+        self.actor = networks.actor if average is None else average["actor"]
+        self.keys = tuple(policy.modalities)
+        self.stacked = tuple(key for key, m in policy.modalities.items() if m.stacked)
+        size = networks.actor.action_dim
+        low, high = bounds or ([-1.0] * size, [1.0] * size)
+        self.register_buffer("low", torch.tensor(low, dtype=torch.float32))
+        self.register_buffer("high", torch.tensor(high, dtype=torch.float32))
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the action (A,) and the former frames (K - 1, H, W, C) of each camera.
+
+        Args:
+            *inputs: the observation by `keys`, then the former frames by `stacked`.
+        """
+        observation = dict(zip(self.keys, inputs, strict=False))
+        former = dict(zip(self.stacked, inputs[len(self.keys) :], strict=True))
+        stacks = {
+            key: torch.cat([former[key], observation[key].unsqueeze(0)]) for key in self.stacked
+        }
+        encoded = self.encoders({k: v.unsqueeze(0) for k, v in (observation | stacks).items()})
+        best: Any = self.actor.best
+        action = best(self.actor(self.fusion(encoded)))[0]
+        scaled = self.low + (action + 1.0) * 0.5 * (self.high - self.low)
+        return scaled, *(stacks[key][1:] for key in self.stacked)
+
+
+def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
+    """Export a policy; write its card beside it, as JSON.
+
+    Args:
+        policy: the policy.
+        output: the file; the card has the same name with `.json` appended.
+        form: `onnx` or `torch`.
+
+    Returns:
+        The card: inputs and outputs with shapes, types and bounds, the source, the latency.
+
+    Raises:
+        MerlError: the policy is that of a user's own agent, a package is missing, or a file cannot
+            be written.
+    """
+    check_choice("form", form, get_args(Form))
+    recorded = {} if policy.run is None else record.read(policy.run.path)
+    bounds = recorded.get("action_space", {}).get("own_bounds")
+    module = Deployed(policy, None if bounds is None else (bounds[0], bounds[1]))
+    example = inputs_of(policy, seed=0)
+    names = [*module.keys, *(key + FORMER for key in module.stacked)]
+    outputs = ["action", *(key + NEXT for key in module.stacked)]
+    arguments = tuple(torch.from_numpy(example[name]) for name in names)
+    part = output.with_name(f".{output.name}.part")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with torch.no_grad(), _quiet():
+            if form == "onnx":
+                _write_onnx(module, arguments, names, outputs, part)
+            else:
+                with part.open("wb") as file:
+                    torch.export.save(torch.export.export(module, arguments), file)
+        part.replace(output)
+        run = load_exported(output, names, outputs)
+        card = {
+            "format": form,
+            "merl": merl.__version__,
+            "task": policy.config.task,
+            "agent": policy.config.agent_name,
+            "step": policy.step,
+            "commit": recorded.get("commit"),
+            "inputs": {name: _told(example[name]) for name in names},
+            "outputs": {name: _told(value) for name, value in run(example).items()},
+            "action_bounds": [module.low.tolist(), module.high.tolist()],
+            "former_frames": "at the start of an episode, copies of the first frame",
+            "milliseconds": _latency(run, example),
+        }
+        output.with_name(f"{output.name}.json").write_text(json.dumps(card, indent=1) + "\n")
+    except OSError as error:
+        raise MerlError(f"{output} cannot be written: {error.strerror}") from None
+    finally:
+        part.unlink(missing_ok=True)
+    return card
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Suppress the exporters' messages about packages and internals that no policy needs."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
+
+
+def _write_onnx(
+    module: Deployed,
+    arguments: tuple[Tensor, ...],
+    names: list[str],
+    outputs: list[str],
+    output: Path,
+) -> None:
+    try:
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError:
+        raise MerlError(
+            "ONNX needs further packages: pip install 'merl-rl[onnx]', or use --to torch"
+        ) from None
+    program = torch.onnx.export(
+        module,
+        arguments,
+        dynamo=True,
+        input_names=names,
+        output_names=outputs,
+        verbose=False,
+        external_data=False,
+    )
+    assert program is not None
+    program.save(str(output), external_data=False)
+
+
+def load_exported(path: Path, names: list[str], outputs: list[str]) -> Run:
+    """Load an exported policy; return it as a function from inputs by name to outputs by name."""
+    if path.suffix == SUFFIXES["onnx"]:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        session = onnxruntime.InferenceSession(
+            str(path), options, providers=["CPUExecutionProvider"]
+        )
+        return lambda values: dict(
+            zip(outputs, session.run(outputs, {name: values[name] for name in names}), strict=True)
+        )
+    module = torch.export.load(path).module()
+
+    def run(values: Values) -> dict[str, NDArray[Any]]:
+        with torch.inference_mode():
+            found = module(*(torch.from_numpy(values[name]) for name in names))
+        return {name: value.numpy() for name, value in zip(outputs, found, strict=True)}
+
+    return run
+
+
+def inputs_of(policy: Policy, seed: int) -> dict[str, NDArray[Any]]:
+    """Return random inputs of an exported policy."""
+    generator = torch.Generator().manual_seed(seed)
+    frames = policy.config.replay.frame_stack
+    found = {key: m.random(1, frames, generator)[0] for key, m in policy.modalities.items()}
+    stacked = {key: value for key, value in found.items() if policy.modalities[key].stacked}
+    newest = found | {key: value[-1] for key, value in stacked.items()}
+    former = {key + FORMER: value[:-1] for key, value in stacked.items()}
+    return {key: value.contiguous().numpy() for key, value in (newest | former).items()}
+
+
+def _told(value: NDArray[Any]) -> dict[str, Any]:
+    return {"dtype": str(value.dtype), "shape": list(value.shape)}
+
+
+def _latency(run: Run, example: Values) -> dict[str, float]:
+    """Return the median and the 99th percentile of a call's time on one thread, ms."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    times = []
+    for _ in range(CALLS):
+        begin = time.perf_counter()
+        run(example)
+        times.append(1000 * (time.perf_counter() - begin))
+    torch.set_num_threads(threads)
+    middle, late = np.percentile(times[CALLS // 10 :], [50, 99])
+    return {"p50": round(float(middle), 3), "p99": round(float(late), 3)}

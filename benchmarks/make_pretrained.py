@@ -20,6 +20,7 @@ from safetensors.torch import load_file, save_file
 import merl
 from merl.core.statistics import Interval
 from merl.runs.checkpoint import Checkpoint
+from merl.runs.demonstrations import Demonstrations
 from merl.runs.run import Run
 from merl.runs.run_folder import PRETRAINED
 
@@ -32,6 +33,7 @@ def write_policy(run: Run, checkpoint: Checkpoint, folder: Path) -> None:
     """Write the parts of a run that `load_policy` reads."""
     record = json.loads((run.path / "config.json").read_text())
     record["config"]["run_dir"] = None
+    record["config"]["replay"]["demos"] = None  # a path of its machine; the digest stays
     record["id"] = uuid.uuid4().hex  # the run's own id is a secret of its machine
     record.pop("resumed", None)
     at = folder / "checkpoints" / checkpoint.path.name
@@ -62,9 +64,11 @@ def fingerprint(path: Path) -> dict[str, object]:
     return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
-def write_card(run: Run, step: int, name: str) -> None:
+def write_card(run: Run, step: int, name: str, commit: str | None) -> None:
     """Evaluate the policy and write its card."""
     record = json.loads((run.path / "config.json").read_text())
+    demos = run.config.replay.demos
+    shown_by = "none" if demos is None else told(Demonstrations.open(demos))
     result = merl.load_policy(f"pretrained/{name}").evaluate(episodes=EPISODES)
     success = result.success_end
     with (run.path / "metrics.csv").open() as file:
@@ -79,8 +83,9 @@ def write_card(run: Run, step: int, name: str) -> None:
 | task | `{config.task}` |
 | agent, preset, seed | {config.agent_name}, {record["preset"]}, {config.seed} |
 | observations | {", ".join(record["observation_space"])} |
+| demonstrations | {shown_by} |
 | trained for | {step:,} steps, {hours:.1f} hours on {where} |
-| commit | {record["commit"]} |
+| commit | {commit or record["commit"]} |
 | return, {EPISODES} episodes | {shown(result.returns, ".0f")} |
 | success at the end | {"not reported" if success is None else shown(success, ".0%")} |
 
@@ -88,6 +93,11 @@ The intervals are 95 % over episodes: `merl evaluate pretrained/{name} --episode
 weights are stored in bf16. The policy can be evaluated and deployed; it cannot be trained further.
 """
     )
+
+
+def told(demos: Demonstrations) -> str:
+    """Return the number of demonstrations and who acted, as text."""
+    return f"{len(demos.lines)} episodes by {demos.source}"
 
 
 def shown(interval: Interval, form: str) -> str:
@@ -101,11 +111,12 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("name")
     parser.add_argument("--checkpoint", default="latest")
+    parser.add_argument("--commit", help="if the run was not trained from a Git checkout")
     options = parser.parse_args()
     run = Run.open(options.run)
     checkpoint = Checkpoint.find(run.checkpoints, options.checkpoint)
     write_policy(run, checkpoint, PRETRAINED / options.name)
-    write_card(run, checkpoint.step, options.name)
+    write_card(run, checkpoint.step, options.name, options.commit)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,9 @@ from safetensors.torch import load_file
 
 from helpers import flat
 from merl.cli import main
+from merl.evaluation.demonstrating import record_episodes
 from merl.runs.demonstrations import Demonstrations
+from toy import DotEnv
 
 TINY = ["--preset", "smoke", "--agent.keys", "proprio", "--eval.video", "none", "--threads", "1"]
 TINY += ["--eval.every", "500", "--eval.episodes", "1", "--random-steps", "50"]
@@ -95,6 +97,32 @@ def test_other_demonstrations_are_refused_on_resume(
     assert "holds other demonstrations than those with which the run began" in error
 
 
+def test_demonstrations_of_another_task_or_reward_are_refused(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train = ["train", *TINY, "--run-dir", str(tmp_path / "run"), "--replay.demos"]
+    assert main([*train, str(demos), "move_box"]) == 2
+    assert "holds demonstrations of reach_duplo, not of move_box" in capsys.readouterr().err
+    index = json.loads((demos / "demos.json").read_text())
+    index |= {"task": "move_box", "options": {"reward": "staged"}}
+    shutil.copytree(demos, tmp_path / "demos")
+    (tmp_path / "demos/demos.json").write_text(json.dumps(index))
+    assert main([*train, str(tmp_path / "demos"), "move_box"]) == 2
+    assert "recorded with --reward staged, and the run has paper" in capsys.readouterr().err
+
+
+def test_an_environment_may_reuse_its_arrays() -> None:
+    class Reusing(DotEnv):
+        buffer = np.zeros(2, np.float32)
+
+        def _observe(self) -> dict[str, np.ndarray]:
+            self.buffer[:] = self.x, self.steps
+            return {"joint": self.buffer}
+
+    (episode,) = record_episodes(lambda _: np.zeros(1), Reusing(), 1, failures=True)
+    assert episode.observations["joint"][:, 1].tolist() == [*range(11)]
+
+
 def test_a_policy_can_demonstrate(tmp_path: Path) -> None:
     record = ["demos", "record", "reach_duplo", "--from", "pretrained/reach_duplo"]
     record += ["--preset", "laptop", "--noise", "0", "--episodes", "1", "--failures"]
@@ -112,6 +140,10 @@ def test_a_policy_can_demonstrate(tmp_path: Path) -> None:
         (["demos", "record", "reach_duplo", "--noise", "2"], "--noise must be at least 0"),
         (["demos", "show", "nowhere"], "nowhere holds no demonstrations"),
         (["train", "reach_duplo", *TINY, "--agent", "bc"], "learns from demonstrations alone"),
+        (
+            ["train", "reach_duplo", *TINY, "--agent.clone-weight", "1"],
+            "agent.clone-weight 1.0 clones demonstrations",
+        ),
         (
             ["train", "reach_duplo", *TINY, "--replay.demos", "nowhere"],
             "nowhere holds no demonstrations",

@@ -205,6 +205,20 @@ def test_the_script_for_slurm_trains_and_requeues(folder: Path) -> None:
     assert evaluated(folder) == [RUNS[2]]
 
 
+def test_the_folder_of_another_experiment_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    train = ["train", "reach_duplo", "--preset", "smoke", "--steps", "260", "--threads", "1"]
+    train += ["--eval.every", "0", "--run-dir", "sweeps/smoke/reach_duplo-no_norm-s0"]
+    assert main(train) == 0
+    capsys.readouterr()
+    sweep = ["sweep", "fig3c", "--preset", "smoke", "--tasks", "reach_duplo", "--seeds", "1"]
+    assert main([*sweep, "--steps", "260"]) == 2
+    error = capsys.readouterr().err
+    assert "holds a run of another experiment (agent.fusion_norm True, not False)" in error
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

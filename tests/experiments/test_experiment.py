@@ -80,6 +80,23 @@ def test_scheduled_noise_falls_within_the_run(steps: int, expected: int) -> None
     assert drqv2.agent.noise_steps == expected
 
 
+def test_published_schedules_and_given_values_stay() -> None:
+    published = Variant("published", "drqv2", setting="published")
+    given = Variant("given", "drqv2", {"agent.noise-steps": 70_000})
+    experiment = Experiment("", (published, given), ("reach_duplo",))
+    first, second = plan(experiment, preset="laptop", seeds=[0], out=OUT, values={"steps": 300_000})
+    assert first.config.agent.noise_steps == 1_000_000
+    assert second.config.agent.noise_steps == 70_000
+    assert second.arguments.count("--agent.noise-steps") == 1
+
+
+@pytest.mark.parametrize("name", ["task", "seed", "run_dir", "run-dir"])
+def test_what_a_sweep_sets_itself_is_refused(name: str) -> None:
+    experiment = Experiment("", (Variant("a", values={name: "x"}),), ("reach_duplo",))
+    with pytest.raises(MerlError, match="a sweep sets"):
+        plan(experiment, preset="laptop", seeds=[0], out=OUT)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [

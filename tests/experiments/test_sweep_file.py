@@ -70,6 +70,8 @@ def test_a_file_with_a_grid(tmp_path: Path) -> None:
         ('task = ["move_box"]', "key 'task' is unknown: did you mean 'tasks'"),
         ('tasks = ["a"]', r"needs one of \[variants.NAME\], a table each, and \[grid\]"),
         ('tasks = ["a"]\n[grid]\ntau = 3', r"\[grid\] needs a list of values for tau, not 3"),
+        ('tasks = ["a"]\n[variants]', r"needs one of \[variants.NAME\]"),
+        ('tasks = ["a"]\n[variants.b]\nagent_name = 5', "agent_name must be a text, not 5"),
         ('tasks = ["a"]\n[variants]\ntau = 3', "variants.tau must be a table, not 3"),
     ],
 )
@@ -79,6 +81,34 @@ def test_a_file_that_cannot_work_is_refused_in_one_line(
     with pytest.raises(MerlError, match=message) as caught:
         read_experiment(write(tmp_path, text))
     assert "mine.toml" in str(caught.value)
+
+
+def test_agents_and_lists_can_be_values_of_a_grid(tmp_path: Path) -> None:
+    text = """
+tasks = ["reach_duplo"]
+[grid]
+agent_name = ["merl", "proprio"]
+agent.conv_strides = [[2, 2, 1], [2, 1, 1]]
+"""
+    experiment = read_experiment(write(tmp_path, text))
+    runs = plan(experiment, preset="laptop", seeds=[0], out=tmp_path)
+    found = [(run.config.agent_name, run.config.agent.conv_strides) for run in runs]
+    strides = [(2, 2, 1), (2, 1, 1)]
+    assert found == [(agent, each) for agent in ("merl", "proprio") for each in strides]
+    assert len({run.folder for run in runs}) == 4
+
+
+def test_an_agent_for_all_variants(tmp_path: Path) -> None:
+    text = """
+tasks = ["reach_duplo"]
+[values]
+agent_name = "sac"
+[variants.one]
+[variants.two]
+agent_name = "ddpg"
+"""
+    experiment = read_experiment(write(tmp_path, text))
+    assert [variant.agent for variant in experiment.variants] == ["sac", "ddpg"]
 
 
 def test_a_file_that_is_missing_or_not_text(tmp_path: Path) -> None:

@@ -72,6 +72,55 @@ def test_the_evaluation_of_a_sweep_is_the_final_result(tmp_path: Path) -> None:
     assert (plain.final("return"), plain.final("success_end")) == (30.0, 0.9)
 
 
+def test_an_evaluation_from_before_the_last_steps_does_not_count(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "a-s0", UP, RATES, final=(25.0, 0.5))
+    content = (run / "evaluation.json").read_text()
+    (run / "evaluation.json").write_text(content.replace('"step": 3000', '"step": 2000'))
+    assert read_run(run).final("return") == 30.0
+
+
+def test_the_metrics_of_a_run_are_the_run(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, UP, RATES, tau=i) for i, name in enumerate(("a", "b"))]
+    files = [run / "metrics.csv" for run in runs]
+    groups, _ = collect([*files, *runs, tmp_path])
+    assert [group.label for group in groups] == ["a", "b"]
+    assert [len(group.runs) for group in groups] == [1, 1]
+
+
+def test_forms_of_a_task_are_not_mixed(tmp_path: Path) -> None:
+    plain = write_run(tmp_path / "a-s0", UP, RATES, task="move_box")
+    staged = write_run(tmp_path / "b-s0", UP, RATES, task="move_box")
+    config = (staged / "config.json").read_text()
+    (staged / "config.json").write_text(config.replace('"reward": "paper"', '"reward": "staged"'))
+    groups, _ = collect([plain, staged])
+    assert [group.task for group in groups] == ["move_box", "move_box staged"]
+
+
+@pytest.mark.parametrize("value", ['"x"', "5", "null"])
+def test_a_record_that_cannot_be_used_is_skipped(tmp_path: Path, value: str) -> None:
+    good, bad = (write_run(tmp_path / name, UP, RATES) for name in ("good-s0", "bad-s0"))
+    config = (bad / "config.json").read_text()
+    (bad / "config.json").write_text(config.replace('"occluded": false', f'"occluded": {value}'))
+    groups, notes = collect([good, bad])
+    if value != "null":
+        assert len(groups[0].runs) == 1
+        assert any("bad-s0" in note for note in notes)
+
+
+def test_seeds_that_occur_twice_are_named(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / str(i) / "a-s0", UP, RATES) for i in range(2)]
+    _, notes = collect(runs)
+    assert "reach_duplo: a has seed 0 more than once: each run counts" in notes
+
+
+def test_infinite_numbers_are_skipped(tmp_path: Path) -> None:
+    good, bad = (write_run(tmp_path / name, UP, RATES) for name in ("good-s0", "bad-s0"))
+    (bad / "metrics.csv").write_text(f"{COLUMNS}\n1000,60,1,inf,0.5\n")
+    groups, notes = collect([good, bad])
+    assert len(groups) == 1
+    assert any("bad-s0 contains infinite numbers" in note for note in notes)
+
+
 def test_references_are_those_of_the_evaluated_form(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path / "a-s0", UP, RATES))
     assert run.references["random actions"] == pytest.approx(7.8, abs=0.05)

@@ -34,7 +34,7 @@ def test_results_of_a_group(two_variants: Path) -> None:
     assert (row.steps, row.minutes.mean, row.spread) == (3000, 3.0, 1.0)
     final = results["final return"]
     assert (final.mean, final.low, final.high, final.count) == (201.0, 200.0, 202.0, 3)
-    assert results["area"].mean == pytest.approx((50 + 150.5) / 2)
+    assert results["mean return"].mean == pytest.approx((50 + 150.5) / 2)
     assert results["final success"].mean == pytest.approx((0.7 + 0.9 + 0.9) / 3)
     assert results["steps to 50% success"].mean == pytest.approx((3000 + 2000 + 2000) / 3)
     assert results["minutes to 50% success"].mean == pytest.approx(7 / 3)

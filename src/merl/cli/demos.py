@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,6 +25,7 @@ from merl.envs.expert import ExpertPolicy
 from merl.envs.registration import ENV_IDS
 from merl.evaluation.demonstrating import record_episodes
 from merl.evaluation.policy import Policy, load_policy
+from merl.experiments.experiment import flags
 from merl.experiments.presets import PRESETS, compose, default_preset
 from merl.runs.demonstrations import Demonstrations, Recorder
 
@@ -106,6 +108,8 @@ def record(args: list[str]) -> int:
     with ExitStack() as stack:
         made = make_env(options.task, **settings)
         stack.callback(made.close)
+        if options.source != EXPERT and load_policy(options.source).config.task != options.task:
+            raise MerlError(f"{options.source} was trained on another task than {options.task}")
         policy: ExpertPolicy | Policy = (
             ExpertPolicy(made) if options.source == EXPERT else load_policy(options.source)
         )
@@ -113,7 +117,10 @@ def record(args: list[str]) -> int:
         source = f"{options.source}, noise {options.noise:g}"
         assert isinstance(made.observation_space, spaces.Dict)
         assert isinstance(made.action_space, spaces.Box)
-        recorder = Recorder(out, options.task, source, made.observation_space, made.action_space)
+        form = {name: settings[name] for name in ("reward", "start", "occluded")}
+        recorder = Recorder(
+            out, options.task, source, made.observation_space, made.action_space, form
+        )
         found = record_episodes(
             policy,
             made,
@@ -127,8 +134,14 @@ def record(args: list[str]) -> int:
             for episode in found:
                 recorder.add(episode)
     _describe(console, recorder.demonstrations)
-    line = f"merl train {options.task} --preset {preset} --replay.demos {out}"
-    console.print(f"learn from them: {line}", highlight=False, soft_wrap=True)
+    changed = {
+        f"env.{name}": value
+        for name, value in settings.items()
+        if name != "observations" and value != getattr(env, name)
+    }
+    given = [part for name, value in changed.items() for part in flags(name, value)]
+    line = ["merl", "train", options.task, "--preset", preset, *given, "--replay.demos", str(out)]
+    console.print(f"learn from them: {shlex.join(line)}", highlight=False, soft_wrap=True)
     return 0
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from merl.cli.output import make_console
 from merl.cli.parsing import parse
-from merl.core import MerlError, counted
+from merl.core import MerlError, counted, suggest
 from merl.core.fields import Range, check_fields
 from merl.report.collect import collect
 
@@ -30,6 +30,8 @@ class ReportOptions:
     """Folder of the report: index.html, table.csv, and each figure as PNG and SVG."""
     title: str = "Learning curves"
     """Title of the page."""
+    baseline: str | None = None
+    """Label of the curve that is compared with the others; by default the first by name."""
     watch: Annotated[int, Range(1)] | None = None
     """Make the report again every so many seconds, while runs are training."""
 
@@ -64,6 +66,12 @@ def _report(options: ReportOptions, console: Console, before: list[str]) -> list
     for note in notes:
         if note not in before:
             console.print(note, highlight=False, soft_wrap=True)
+    if options.baseline is not None and groups:
+        labels = sorted({group.label for group in groups})
+        if options.baseline not in labels:
+            hint = suggest(options.baseline, labels)
+            raise MerlError(f"--baseline {options.baseline!r} is none of the curves: {hint}")
+        groups.sort(key=lambda group: group.label != options.baseline)
     if groups:
         page = write_report(groups, notes, options.out, options.title, options.watch)
         runs = sum(len(group.runs) for group in groups)

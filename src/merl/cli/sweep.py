@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from merl.cli.parsing import check_writable, parse
 from merl.core import MerlError, check_choice, counted, suggest
 from merl.core.fields import NOT_EMPTY, Range, check_fields
 from merl.core.statistics import bootstrap_interval, wilson_interval
+from merl.envs.user_env import load_module
 from merl.experiments.experiment import Experiment, PlannedRun, plan
 from merl.experiments.on_ray import run_on_ray
 from merl.experiments.paper import EXPERIMENTS
@@ -102,10 +104,10 @@ def sweep(args: list[str]) -> int:
         tasks=options.tasks,
         values={} if options.steps is None else {"steps": options.steps},
     )
-    missing = [run for run in runs if not is_done(run)]
+    settings = Settings(_threads(options), options.episodes, options.retries)
+    missing = [run for run in runs if not is_done(run, settings.episodes)]
     counts = f"{counted(len(runs), 'run')} in {out}, {len(runs) - len(missing)} done"
     console.print(f"{experiment.title}: {counts}", highlight=False, soft_wrap=True)
-    settings = Settings(_threads(options), options.episodes, options.retries)
     if options.dry_run:
         _list(console, runs, settings, options.jobs)
         return 0
@@ -119,7 +121,7 @@ def sweep(args: list[str]) -> int:
         return 0
     check_folder(out)
     stopped, failed = _run(console, missing, settings, options) if missing else (None, {})
-    console.print(_results(runs, failed))
+    console.print(_results(runs, settings, failed))
     if stopped is not None:
         console.print("stopped: the same command continues")
         return 128 + stopped
@@ -200,18 +202,23 @@ def _list(console: Console, runs: Sequence[PlannedRun], settings: Settings, jobs
     hours, left = dict[str, float | str](), 0.0
     with console.status("timing each variant on this machine", spinner="line"):
         for run in runs:
-            if run.variant not in hours:
-                hours[run.variant] = _hours(run, settings)
+            key = f"{run.config.task} {run.variant}"
+            if key not in hours and not is_done(run, settings.episodes):
+                hours[key] = _hours(run, settings)
     table = Table("run", "state", "hours", box=None, padding=(0, 2))
     for run in runs:
-        cost, at = hours[run.variant], steps_of(run.folder)
-        state = "done" if is_done(run) else f"{at:,} steps" if at else "missing"
+        at = steps_of(run.folder)
+        cost = hours.get(f"{run.config.task} {run.variant}", "")
+        state = "done" if is_done(run, settings.episodes) else f"{at:,} steps" if at else "missing"
         if not isinstance(cost, str) and state != "done":
             left += cost * (1 - min(1.0, at / run.config.steps))
         table.add_row(run.name, state, cost if isinstance(cost, str) else f"{cost:.2g}")
     console.print(table)
     for run in runs:
-        console.print(f"merl train {' '.join(run.arguments)}", highlight=False, soft_wrap=True)
+        console.print(f"merl train {shlex.join(run.arguments)}", highlight=False, soft_wrap=True)
+    unknown = sum(isinstance(cost, str) for cost in hours.values())
+    if unknown:
+        console.print(f"the cost of {counted(unknown, 'variant')} is unknown")
     console.print(
         f"{left:.3g} hours are left, {left / jobs:.3g} with {counted(jobs, 'run')} at a time "
         "(measured with one run at a time)"
@@ -220,20 +227,24 @@ def _list(console: Console, runs: Sequence[PlannedRun], settings: Settings, jobs
 
 def _hours(run: PlannedRun, settings: Settings) -> float | str:
     """Return the time of a whole run, from timing a step and an update; or why it cannot run."""
-    config = replace(run.config, threads=settings.threads or run.config.threads)
+    most = len(os.sched_getaffinity(0))
+    threads = None if settings.threads is None else min(settings.threads, most)
+    config = replace(run.config, threads=threads or run.config.threads)
     try:
+        if config.has_user_env and ":" in config.task:
+            load_module(config.task, Path.cwd())
         with Setup.prepare(config, new=False) as setup:
             return setup.timing.seconds(config) / 3600
     except MerlError as error:
         return str(error)
 
 
-def _results(runs: Sequence[PlannedRun], failed: dict[str, str]) -> Table:
+def _results(runs: Sequence[PlannedRun], settings: Settings, failed: dict[str, str]) -> Table:
     table = Table("run", "step", "result", box=None, padding=(0, 2))
     for run in runs:
         step = f"{steps_of(run.folder):,}"
         why = f"failed: {failed[run.name]}" if run.name in failed else "missing"
-        table.add_row(run.name, step, _result(run) if is_done(run) else why)
+        table.add_row(run.name, step, _result(run) if is_done(run, settings.episodes) else why)
     return table
 
 

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.core import MerlError
+from merl.core import MerlError, Observation
 from merl.core.guards import check_finite
 from merl.evaluation.evaluation import Act
 from merl.runs.demonstrations import Episode
@@ -66,7 +66,7 @@ def _episode(
     rng = np.random.default_rng(seed)
     observation, _ = env.reset(seed=seed)
     reset()
-    seen, rewards = [observation], list[float]()
+    seen, rewards = [_copied(observation)], list[float]()
     actions: list[NDArray[np.float32]] = []
     intended: list[NDArray[np.float32]] = []
     terminated = truncated = False
@@ -79,15 +79,20 @@ def _episode(
         action = action.clip(-1.0, 1.0)
         observation, reward, terminated, truncated, info = env.step(action)
         check_finite(observation, float(reward), len(actions) + 1)
-        seen.append(observation)
+        seen.append(_copied(observation))
         actions.append(action)
         rewards.append(float(reward))
         success = bool(info["success"]) if "success" in info else success
     return Episode(
-        {key: np.stack([each[key] for each in seen]) for key in observation},
+        {key: np.stack([each[key] for each in seen]) for key in seen[0]},
         np.stack(actions),
         np.stack(intended),
         np.array(rewards, np.float32),
         terminated,
         success,
     )
+
+
+def _copied(observation: Observation) -> dict[str, NDArray[Any]]:
+    """Return a copy: an environment may write the next observation into the same arrays."""
+    return {key: np.array(value) for key, value in observation.items()}

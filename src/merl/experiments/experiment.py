@@ -124,10 +124,18 @@ def _planned(
     name = re.sub(r"[^\w.=-]+", "-", f"{task}-{variant.name}-s{seed}")
     own_preset = variant.preset or _preset(preset, variant.agent)
     base = compose(own_preset, task, variant.agent, variant.setting)
-    given = {**experiment.values, **variant.values, **values}
+    given = {
+        name.replace("-", "_") if "encoder" not in name else name: value
+        for part in (experiment.values, variant.values, values)
+        for name, value in part.items()
+    }
+    for own in ("task", "seed", "run_dir"):
+        if own in given:
+            raise MerlError(f"a sweep sets {own} itself: leave it out of the values")
     config = override(base, given)
     agent: Any = config.agent
-    if getattr(agent, "noise_std_end", None) is not None and "agent.noise_steps" not in given:
+    fades = getattr(agent, "noise_std_end", None) is not None and variant.setting == "matched"
+    if fades and "agent.noise_steps" not in given:
         # As in `compose`, the noise falls within the run, whose length is known only now.
         given["agent.noise_steps"] = min(type(agent)().noise_steps, config.steps // 2)
         config = override(base, given)

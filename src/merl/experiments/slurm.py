@@ -30,10 +30,11 @@ def write_array(
     lines = [
         "#!/usr/bin/env bash",
         "#SBATCH --job-name=merl",
+        "#SBATCH --ntasks=1",
         f"#SBATCH --array=0-{len(runs) - 1}",
         f"#SBATCH --cpus-per-task={max(1, round(cpus))}",
         *([f"#SBATCH --gpus-per-task={max(1, round(gpus))}"] if gpus else []),
-        f"#SBATCH --output={runs[0].folder.parent}/slurm-%A-%a.log",
+        f'#SBATCH --output="{runs[0].folder.parent}/slurm-%A-%a.log"',
         "#SBATCH --open-mode=append",
         "# Two minutes before its end a run saves; then it is queued again and resumes.",
         "#SBATCH --signal=B:USR1@120 --requeue",

@@ -20,12 +20,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from merl.core import EVALUATION_FILE, LOCK_FILE, METRICS_FILE, MerlError
+from merl.config import flat
+from merl.core import (
+    CONFIG_FILE,
+    EVALUATION_FILE,
+    HARMLESS,
+    LOCK_FILE,
+    METRICS_FILE,
+    MerlError,
+)
 from merl.core.signals import Interrupt
 from merl.experiments.experiment import PlannedRun
+from merl.runs.resume import left_open
+from merl.runs.run import Run
 
-ENVIRONMENT_FAILED = 4
-"""Exit code after which a run is tried again, as after a crash. Others are the user's to fix."""
+TRACEBACK, ENVIRONMENT_FAILED = 1, 4
+"""Exit codes after which a run is tried again, as after a crash. Others are the user's to fix."""
 POLL = 0.2
 """Seconds between looks at a process."""
 LOCK_PATIENCE = 120.0
@@ -62,12 +72,27 @@ class Outcome:
     seconds: float
 
 
-def is_done(run: PlannedRun) -> bool:
-    """Return whether a run is trained to its end and evaluated."""
+def is_done(run: PlannedRun, episodes: int) -> bool:
+    """Return whether a run is trained to its end and evaluated over so many episodes.
+
+    Raises:
+        MerlError: the folder holds a run with another config.
+    """
+    if not (run.folder / CONFIG_FILE).exists():
+        return False
+    recorded, wanted = flat(Run.open(run.folder).config), flat(run.config)
+    open_fields = left_open(run.config)
+    for name, value in wanted.items():
+        same = recorded.get(name) == value or name in (*HARMLESS, *open_fields, "run_dir")
+        if not same and name in recorded:
+            raise MerlError(
+                f"{run.folder} holds a run of another experiment ({name} {recorded[name]}, not "
+                f"{value}): name another folder with --out"
+            )
     evaluated = evaluation_of(run.folder)
-    return evaluated is not None and (
-        run.config.minutes is not None or evaluated["step"] >= run.config.steps
-    )
+    if evaluated is None or len(evaluated["episodes"]) < episodes:
+        return False
+    return run.config.minutes is not None or evaluated["step"] >= run.config.steps
 
 
 def evaluation_of(folder: Path) -> dict[str, Any] | None:
@@ -125,14 +150,15 @@ def execute(
     for command in commands(run, settings):
         for attempt in range(settings.retries + 1):
             _wait_for_lock(run.folder, stopped)
+            begin = log.stat().st_size if log.exists() else 0
             code = _call([sys.executable, "-m", "merl.cli", *command], log, stopped, folder)
             if stopped():
                 return None
             if code == 0:
                 break
-            crashed = code < 0 or code == ENVIRONMENT_FAILED or code > 128
+            crashed = code < 0 or code in (TRACEBACK, ENVIRONMENT_FAILED) or code > 128
             if not crashed or attempt == settings.retries:
-                return f"{_reason(code, log)} (log: {log})"
+                return f"{_reason(code, log, begin)} (log: {log})"
     return None
 
 
@@ -188,9 +214,9 @@ def _end_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-def _reason(code: int, log: Path) -> str:
-    """Return the last error in a log, or else the exit code, in one line."""
-    text = log.read_bytes()[-20_000:].decode(errors="replace")
+def _reason(code: int, log: Path, begin: int) -> str:
+    """Return the last error in a log from byte `begin` on, or the exit code, in one line."""
+    text = log.read_bytes()[begin:][-20_000:].decode(errors="replace")
     found = [line for line in text.splitlines() if line.startswith("merl: error: ")]
     if code < 0:
         return f"killed by {signal.Signals(-code).name}"

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,17 +52,24 @@ def read_experiment(path: Path) -> Experiment:
     tasks = content.get("tasks", [])
     if not tasks or not all(isinstance(task, str) for task in tasks):
         raise MerlError(f'{path} names no tasks: add a line like tasks = ["reach_duplo"]')
-    if ("variants" in content) == ("grid" in content):
+    if bool(content.get("variants")) == bool(content.get("grid")):
         raise MerlError(f"{path} needs one of [variants.NAME], a table each, and [grid]")
-    if "grid" in content:
-        variants = tuple(variants_of(_grid(path, content["grid"])))
+    common = dict(_flat(content.get("values", {})))
+    agent = _agent(path, common)
+    if content.get("grid"):
+        grid = variants_of(_grid(path, content["grid"]))
+        variants = tuple(
+            replace(each, values=(own := dict(each.values)), agent=_agent(path, own))
+            for each in grid
+        )
     else:
         variants = tuple(_variant(path, *item) for item in content["variants"].items())
+    variants = tuple(replace(each, agent=each.agent or agent) for each in variants)
     return Experiment(
         content.get("title", path.stem),
         variants,
         tuple(tasks),
-        dict(_flat(content.get("values", {}))),
+        common,
         content.get("preset"),
     )
 
@@ -79,8 +87,15 @@ def _variant(path: Path, name: str, table: Any) -> Variant:
         raise MerlError(f"{path}: variants.{name} must be a table, not {table!r}")
     own = {key: table[key] for key in ("preset", "setting") if key in table}
     values = dict(_flat({key: value for key, value in table.items() if key not in own}))
+    return Variant(name, _agent(path, values), values, **own)
+
+
+def _agent(path: Path, values: dict[str, Any]) -> str | None:
+    """Take the agent's name out of the values."""
     agent = values.pop("agent_name", None)
-    return Variant(name, agent, values, **own)
+    if not (agent is None or isinstance(agent, str)):
+        raise MerlError(f"{path}: agent_name must be a text, not {agent!r}")
+    return agent
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -89,4 +104,8 @@ def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{name}.")
         else:
-            yield prefix + name, tuple(value) if isinstance(value, list) else value
+            yield prefix + name, _as_tuple(value)
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value

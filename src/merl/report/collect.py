@@ -12,6 +12,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from merl.core import (
     CONFIG_FILE,
     EVALUATION_FILE,
@@ -23,7 +25,7 @@ from merl.core import (
 from merl.envs.config import EnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.report.curves import Array, Curve, curve_of, read_metrics
-from merl.report.references import references
+from merl.report.references import form, references
 
 SUCCESS, RETURN = "success_end", "return"
 UNKNOWN_TASK = "unknown task"
@@ -88,14 +90,23 @@ class SeedRun:
         return {k: v for k, v in self.values.items() if k not in (*HARMLESS, "seed")}
 
     @property
-    def references(self) -> dict[str, float]:
-        """The known returns of the task in the form in which the run is evaluated, by name."""
+    def env(self) -> EnvConfig:
+        """The form of the task in which the run is evaluated."""
         values = self.values
         start = values.get("eval.start") or values.get("env.start")
-        form = {name: values.get(f"env.{name}") for name in ("occluded", "reward")}
-        form |= {"start": tuple(start) if start else None}
-        env = EnvConfig(**{name: value for name, value in form.items() if value is not None})
-        return {one.name: one.returns.mean for one in references(self.task, env)}
+        given = {name: values.get(f"env.{name}") for name in ("occluded", "reward")}
+        given |= {"start": tuple(start) if start else None}
+        return EnvConfig(**{name: value for name, value in given.items() if value is not None})
+
+    @property
+    def form(self) -> str:
+        """The task with the options that change what is solved, e.g. "lift_box staged"."""
+        return form(self.task, self.env)
+
+    @property
+    def references(self) -> dict[str, float]:
+        """The known returns of the task in this form, by name."""
+        return {one.name: one.returns.mean for one in references(self.task, self.env)}
 
     @property
     def videos(self) -> dict[int, Path]:
@@ -124,7 +135,7 @@ class Group:
 
     Attributes:
         label: its name in figures and tables.
-        task: the task.
+        task: the task, with the options that change what is solved.
         runs: the runs, by seed.
     """
 
@@ -157,13 +168,14 @@ def collect(paths: Iterable[Path]) -> tuple[list[Group], list[str]]:
     """
     notes: list[str] = []
     runs: list[SeedRun] = []
-    for path in dict.fromkeys(each for given in paths for each in _expand(given, notes)):
+    found = (each for given in paths for each in _expand(given, notes))
+    for path in {each.resolve(): each for each in found}.values():
         try:
             run = read_run(path)
         except MerlError as error:
             notes.append(f"skipped: {error}")
             continue
-        if len(run.curve(RETURN).steps) == 0:
+        if len(run.curve(RETURN).steps) == 0 and not run.episodes:
             notes.append(f"skipped: {path} has no evaluation yet")
             continue
         if run.active:
@@ -181,10 +193,26 @@ def read_run(path: Path) -> SeedRun:
     Raises:
         MerlError: its metrics are missing or cannot be read.
     """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise MerlError(f"{str(path)!r} has a name that is not UTF-8: rename it") from None
     metrics = read_metrics(path)
-    record, episodes = _json(path / CONFIG_FILE), _json(path / EVALUATION_FILE).get("episodes")
+    if any(np.isinf(column).any() for column in metrics.values()):
+        raise MerlError(f"{path} contains infinite numbers")
+    record, evaluation = _json(path / CONFIG_FILE), _json(path / EVALUATION_FILE)
+    episodes, step = evaluation.get("episodes"), evaluation.get("step")
+    last = float(metrics["step"][-1]) if len(metrics["step"]) else 0.0
+    is_newest = isinstance(step, int) and step >= last  # the run was not trained further
     rows = [row for row in episodes if _is_row(row)] if isinstance(episodes, list) else []
-    return SeedRun(path, record, metrics, tuple(rows), _locked(path / LOCK_FILE))
+    run = SeedRun(
+        path, record, metrics, tuple(rows) if is_newest else (), _locked(path / LOCK_FILE)
+    )
+    try:
+        _ = run.form, run.references  # a record may come from anyone
+    except (MerlError, TypeError, ValueError, AttributeError) as error:
+        raise MerlError(f"{path / CONFIG_FILE} cannot be used: {error}") from None
+    return run
 
 
 def _is_row(row: Any) -> bool:
@@ -195,6 +223,9 @@ def _expand(path: Path, notes: list[str]) -> Iterator[Path]:
     """Yield the runs at a path: itself, or what a folder of runs holds."""
     if not path.exists():
         raise MerlError(f"{path} does not exist: name run folders, CSV files, or a folder of them")
+    if path.name == METRICS_FILE and (path.parent / CONFIG_FILE).exists():
+        yield path.parent
+        return
     if path.is_file() or (path / METRICS_FILE).exists() or (path / CONFIG_FILE).exists():
         yield path
         return
@@ -218,7 +249,7 @@ def _grouped(runs: Sequence[SeedRun]) -> list[Group]:
     for run in runs:
         # Without a record the name decides.
         values = json.dumps(run.learnt, sort_keys=True) if run.learnt else run.label
-        found.setdefault((run.task, values), []).append(run)
+        found.setdefault((run.form, values), []).append(run)
     labels = [(task, its[0].label) for (task, _), its in found.items()]
     groups = []
     for (task, _), its in found.items():
@@ -252,7 +283,11 @@ def _about_seeds(groups: Sequence[Group]) -> Iterator[str]:
                 yield f"{task}: {group.label} has one seed: no interval over seeds"
             elif missing and None not in group.seeds:
                 yield f"{task}: {group.label} lacks seed {', '.join(missing)}, which others have"
-            ends = {int(run.curve(RETURN).steps[-1]) for run in group.runs}
+            twice = {seed for seed in group.seeds if group.seeds.count(seed) > 1} - {None}
+            if twice:
+                named = ", ".join(map(str, sorted(twice, key=str)))
+                yield f"{task}: {group.label} has seed {named} more than once: each run counts"
+            ends = {int(run.metrics["step"][-1]) for run in group.runs}
             if len(ends) > 1:
                 yield (
                     f"{task}: the seeds of {group.label} are of unequal length: their mean ends at "

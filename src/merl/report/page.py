@@ -37,7 +37,7 @@ MOST_VIDEO = 40_000_000
 RESULTS = {
     "final return": ("final return", ".3g", ""),
     "best return": ("best return", ".3g", ""),
-    "mean return": ("area", ".3g", ""),
+    "mean return": ("mean return", ".3g", ""),
     "final success": ("final success", ".0f", " %"),
     "best success": ("best success", ".0f", " %"),
     **{

@@ -91,12 +91,12 @@ def row_of(group: Group) -> Row:
     """Compute the results of a group."""
     runs, seeds = group.runs, len(group.runs)
     curves = [run.curve(RETURN) for run in runs]
-    end = min(float(curve.steps[-1]) for curve in curves)
-    results = {
-        "final return": Estimate.of(group.final(RETURN), seeds),
-        "best return": Estimate.of([float(curve.values.max()) for curve in curves]),
-        "area": Estimate.of([_area(run, end) for run in runs]),
-    }
+    end = min(float(run.metrics["step"][-1]) for run in runs)
+    results = {"final return": Estimate.of(group.final(RETURN), seeds)}
+    if all(len(curve.steps) for curve in curves):
+        end = min(float(curve.steps[-1]) for curve in curves)
+        results["best return"] = Estimate.of([float(curve.values.max()) for curve in curves])
+        results["mean return"] = Estimate.of([_area(run, end) for run in runs])
     success = group.final(SUCCESS)
     if success:
         results["final success"] = Estimate.of(success, seeds)
@@ -107,7 +107,8 @@ def row_of(group: Group) -> Row:
             name = f"{level:.0%} success"
             results[f"steps to {name}"] = Estimate.of([steps for steps, _ in reached], seeds)
             times = [minutes for _, minutes in reached if not math.isnan(minutes)]
-            results[f"minutes to {name}"] = Estimate.of(times, seeds)
+            if len(times) == len(reached):  # else the run has no clock
+                results[f"minutes to {name}"] = Estimate.of(times, seeds)
     minutes = Estimate.of(
         [float(at[-1]) / 60 for run in runs if len(at := run.curve(RETURN, SECONDS).steps)]
     )
@@ -268,10 +269,10 @@ def write_table(rows: Sequence[Row], path: Path) -> None:
     try:
         with path.open("w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow(["task", "variant", "seeds", "steps", "spread", *ends])
+            writer.writerow(["task", "variant", "seeds", "steps", "minutes", "spread", *ends])
             for row in rows:
                 cells: list[object] = [row.group.task, row.group.label]
-                cells += [len(row.group.runs), row.steps, row.spread]
+                cells += [len(row.group.runs), row.steps, row.minutes.mean, row.spread]
                 for name in names:
                     one = row.results.get(name)
                     cells += (

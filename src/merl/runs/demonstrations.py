@@ -12,8 +12,9 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,7 @@ class Demonstrations:
         source: who acted, e.g. "expert, noise 0.1".
         observation_space, action_space: spaces of the environment.
         lines: the episodes.
+        options: options of the task, if it is one of merl's.
     """
 
     path: Path
@@ -83,6 +85,7 @@ class Demonstrations:
     observation_space: spaces.Dict
     action_space: spaces.Box
     lines: tuple[Line, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def open(cls, path: Path) -> Demonstrations:
@@ -101,7 +104,10 @@ class Demonstrations:
             observation: dict[str, spaces.Space[Any]] = {
                 key: box(space) for key, space in found["observation_space"].items()
             }
-            lines = tuple(Line(**line) for line in found["episodes"])
+            lines = tuple(_line(line) for line in found["episodes"])
+            options = found.get("options", {})
+            if not isinstance(options, dict):
+                raise TypeError("options")
             return cls(
                 path,
                 str(found["task"]),
@@ -109,10 +115,13 @@ class Demonstrations:
                 spaces.Dict(observation),
                 box(found["action_space"]),
                 lines,
+                options,
             )
         except FileNotFoundError:
             raise MerlError(
-                f"{path} holds no demonstrations: it has no {INDEX}; `merl demos record` makes them"
+                f"{path} holds no demonstrations: it has no {INDEX}; `merl demos record` makes "
+                "them (if they were moved, resume their run with the command that began it, with "
+                "--resume and their new --replay.demos)"
             ) from None
         except OSError as error:
             raise MerlError(f"{file} cannot be read: {error.strerror}") from None
@@ -141,7 +150,10 @@ class Demonstrations:
             observations = {key: found[_KEY + key] for key in self.observation_space}
             actions, intended, rewards = found["action"], found["intended"], found["reward"]
             terminated = bool(found["terminated"])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except (
+            *(OSError, ValueError, KeyError, EOFError, TypeError, AttributeError),
+            *(zipfile.BadZipFile, zlib.error),
+        ) as error:
             raise MerlError(f"{file} cannot be read: {error}: record it again") from None
         for key, space in self.observation_space.spaces.items():
             expected, values = (line.steps + 1, *(space.shape or ())), observations[key]
@@ -150,9 +162,13 @@ class Demonstrations:
                     f"{file}: observation {key!r} is {values.dtype} {values.shape}, but {INDEX} "
                     f"says {space.dtype} {expected}"
                 )
+        if rewards.shape != (line.steps,) or rewards.dtype.kind != "f":
+            raise MerlError(f"{file}: rewards are {rewards.dtype} {rewards.shape}")
         for each in (actions, intended):
-            if each.shape != (line.steps, *self.action_space.shape):
-                raise MerlError(f"{file}: actions have the shape {each.shape}")
+            if each.shape != (line.steps, *self.action_space.shape) or each.dtype.kind != "f":
+                raise MerlError(f"{file}: actions are {each.dtype} {each.shape}")
+            if np.abs(each).max(initial=0.0) > 1.0:
+                raise MerlError(f"{file}: actions are beyond [-1, 1]: rescale them")
         numbers = (actions, intended, rewards, *observations.values())
         if any(each.dtype.kind == "f" and not np.isfinite(each).all() for each in numbers):
             raise MerlError(f"{file} contains NaN or infinity: remove it from {INDEX}")
@@ -245,6 +261,7 @@ class Recorder:
         task: the task.
         source: who acts.
         observation_space, action_space: spaces of the environment.
+        options: options of the task, if it is one of merl's.
 
     Raises:
         MerlError: the folder holds files, or cannot be created.
@@ -257,6 +274,7 @@ class Recorder:
         source: str,
         observation_space: spaces.Dict,
         action_space: spaces.Box,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -265,7 +283,7 @@ class Recorder:
         except OSError as error:
             raise MerlError(f"{path} cannot be created: {error.strerror}") from None
         self.demonstrations = Demonstrations(
-            path, task, source, observation_space, action_space, ()
+            path, task, source, observation_space, action_space, (), options or {}
         )
 
     def add(self, episode: Episode) -> None:
@@ -285,6 +303,7 @@ class Recorder:
             demos.observation_space,
             demos.action_space,
             (*demos.lines, line),
+            demos.options,
         )
         arrays: dict[str, Any] = {_KEY + key: v for key, v in episode.observations.items()}
         arrays |= {"action": episode.actions, "intended": episode.intended}
@@ -299,11 +318,27 @@ class Recorder:
         self.demonstrations = whole
 
 
+def _line(values: Any) -> Line:
+    """Return a line of the index.
+
+    Raises:
+        TypeError: a value has another type.
+    """
+    line = Line(**values)
+    types = (line.file, str), (line.steps, int), (line.returned, int | float)
+    if not all(isinstance(value, kind) for value, kind in types) or line.steps < 1:
+        raise TypeError(f"the line {values}")
+    if not (line.success is None or isinstance(line.success, bool)):
+        raise TypeError(f"the line {values}")
+    return line
+
+
 def _index(demos: Demonstrations) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "task": demos.task,
         "source": demos.source,
+        "options": dict(demos.options),
         "observation_space": {k: describe(s) for k, s in demos.observation_space.items()},
         "action_space": describe(demos.action_space),
         "episodes": [asdict(line) for line in demos.lines],

@@ -217,8 +217,25 @@ def load_demos(
                 f"agent {config.agent_name} learns from demonstrations alone: name a folder of "
                 "them with --replay.demos; `merl demos record` makes one"
             )
+        if isinstance(config.agent, AgentConfig) and config.agent.clone_weight:
+            raise MerlError(
+                f"agent.clone-weight {config.agent.clone_weight} clones demonstrations: name a "
+                "folder of them with --replay.demos"
+            )
         return None, config
     found = Demonstrations.open(home / replay.demos)
+    if found.task != config.task:
+        raise MerlError(
+            f"{found.path} holds demonstrations of {found.task}, not of {config.task}: name others "
+            "with --replay.demos"
+        )
+    form = {} if config.has_user_env else {"reward": config.env.reward}
+    for name, value in form.items():
+        if found.options.get(name, value) != value:
+            raise MerlError(
+                f"{found.path} was recorded with --{name} {found.options[name]}, and the run has "
+                f"{value}: their rewards do not mix"
+            )
     digest = found.digest()
     if replay.demos_hash not in (None, digest):
         raise MerlError(

@@ -77,8 +77,8 @@ def test_a_graph_reads_noise_and_step_size_from_tensors_that_follow_the_step(
         recorded(step)
         twin.update(batch, step=step)
         for optimizer in (agent.critic_optimizer, agent.actor_optimizer):
-            assert optimizer.param_groups[0]["lr"] is recorded._step_size
-        assert float(recorded._step_size) == pytest.approx(rate)
-        assert float(recorded._noise_std) == pytest.approx(deviation)
+            assert optimizer.param_groups[0]["lr"] is recorded._plan.step_size
+        assert float(recorded._plan.step_size) == pytest.approx(rate)
+        assert float(recorded._plan.noise_std) == pytest.approx(deviation)
     for one, other in zip(agent.networks.parameters(), twin.networks.parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-7)

@@ -74,6 +74,18 @@ class ShowOptions:
     """Folder of the demonstrations."""
 
 
+@dataclass(frozen=True)
+class DemosOptions:
+    """Record or show demonstrations; for tab completion."""
+
+    action: Annotated[
+        Annotated[RecordOptions, tyro.conf.subcommand("record")]
+        | Annotated[ShowOptions, tyro.conf.subcommand("show")],
+        tyro.conf.arg(name=""),
+    ]
+    """What to do."""
+
+
 def demos(args: list[str]) -> int:
     """Record or show demonstrations: merl demos record TASK, merl demos show DIR."""
     action, *rest = args or ["--help"]

@@ -119,7 +119,8 @@ def test_an_environment_may_reuse_its_arrays() -> None:
             self.buffer[:] = self.x, self.steps
             return {"joint": self.buffer}
 
-    (episode,) = record_episodes(lambda _: np.zeros(1), Reusing(), 1, failures=True)
+    (episode,) = record_episodes(lambda _: np.full(1, 3.0), Reusing(), 1, failures=True)
+    assert episode.intended.tolist() == episode.actions.tolist() == [[1.0]] * 10
     assert episode.observations["joint"][:, 1].tolist() == [*range(11)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -73,6 +74,15 @@ def test_a_replay_holds_every_step(demos: Demonstrations, intended: bool) -> Non
     discounts = {round(float(d), 4) for d in batch.discount}
     # 0.9^3, shorter before a time limit, and 0 where the last episode terminated
     assert discounts == {0.729, 0.81, 0.9, 0.0}
+
+
+def test_values_are_stored_in_the_type_of_their_space(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "demos", "a", "b", OBSERVATION, ACTION)
+    one = episode(3)
+    wide = {key: value.astype(np.float64) for key, value in one.observations.items()}
+    recorder.add(dataclasses.replace(one, observations=wide))
+    (found,) = Demonstrations.open(tmp_path / "demos").episodes()
+    np.testing.assert_equal(found.observations, one.observations)
 
 
 def test_keys_that_the_agent_does_not_use_are_left_out(demos: Demonstrations) -> None:

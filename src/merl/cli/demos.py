@@ -120,11 +120,14 @@ def record(args: list[str]) -> int:
     with ExitStack() as stack:
         made = make_env(options.task, **settings)
         stack.callback(made.close)
-        if options.source != EXPERT and load_policy(options.source).config.task != options.task:
-            raise MerlError(f"{options.source} was trained on another task than {options.task}")
         policy: ExpertPolicy | Policy = (
             ExpertPolicy(made) if options.source == EXPERT else load_policy(options.source)
         )
+        if isinstance(policy, Policy) and policy.config.task != options.task:
+            raise MerlError(
+                f"{options.source} was trained on {policy.config.task}, not on {options.task}: "
+                "name another run with --from"
+            )
         out = options.out or Path("demos", options.task)
         source = f"{options.source}, noise {options.noise:g}"
         assert isinstance(made.observation_space, spaces.Dict)

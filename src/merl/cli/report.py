@@ -33,7 +33,7 @@ class ReportOptions:
     baseline: str | None = None
     """Label of the curve that is compared with the others; by default the first by name."""
     watch: Annotated[int, Range(1)] | None = None
-    """Make the report again every so many seconds, while runs are training."""
+    """Repeat the report at this interval, in seconds, while runs are training."""
 
     def __post_init__(self) -> None:
         check_fields(self, "--")

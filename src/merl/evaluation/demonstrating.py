@@ -72,7 +72,7 @@ def _episode(
     terminated = truncated = False
     success: bool | None = None
     while not (terminated or truncated):
-        action = np.asarray(act(observation), np.float32)
+        action = np.asarray(act(observation), np.float32).clip(-1.0, 1.0)
         intended.append(action)
         if noise:
             action = action + rng.normal(0.0, noise, action.shape).astype(np.float32)

@@ -94,7 +94,7 @@ def plan(
         seeds: the seeds of each variant.
         out: the folder that the run folders are in.
         tasks: the tasks; None for all of the experiment.
-        values: values for all runs, which precede those of the experiment and its variants.
+        values: values for all runs, which override those of the experiment and its variants.
 
     Raises:
         MerlError: a task, a preset, an agent or a value is unknown or cannot work.
@@ -125,9 +125,9 @@ def _planned(
     own_preset = variant.preset or _preset(preset, variant.agent)
     base = compose(own_preset, task, variant.agent, variant.setting)
     given = {
-        name.replace("-", "_") if "encoder" not in name else name: value
+        key if "encoder" in key else key.replace("-", "_"): value  # encoders have the user's keys
         for part in (experiment.values, variant.values, values)
-        for name, value in part.items()
+        for key, value in part.items()
     }
     for own in ("task", "seed", "run_dir"):
         if own in given:

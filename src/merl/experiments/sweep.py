@@ -73,7 +73,11 @@ class Outcome:
 
 
 def is_done(run: PlannedRun, episodes: int) -> bool:
-    """Return whether a run is trained to its end and evaluated over so many episodes.
+    """Return whether a run is trained to its end and evaluated.
+
+    Args:
+        run: the run.
+        episodes: minimum number of episodes of the evaluation.
 
     Raises:
         MerlError: the folder holds a run with another config.

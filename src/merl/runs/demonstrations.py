@@ -14,7 +14,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -296,16 +296,11 @@ class Recorder:
         name = f"{len(demos.lines):05}.npz"
         returned = float(np.sum(episode.rewards, dtype=np.float64))
         line = Line(name, len(episode), returned, episode.success)
-        whole = Demonstrations(
-            demos.path,
-            demos.task,
-            demos.source,
-            demos.observation_space,
-            demos.action_space,
-            (*demos.lines, line),
-            demos.options,
-        )
-        arrays: dict[str, Any] = {_KEY + key: v for key, v in episode.observations.items()}
+        whole = replace(demos, lines=(*demos.lines, line))
+        arrays: dict[str, Any] = {  # in the type of the space, as they are checked when read
+            _KEY + key: np.asarray(episode.observations[key], space.dtype)
+            for key, space in demos.observation_space.spaces.items()
+        }
         arrays |= {"action": episode.actions, "intended": episode.intended}
         arrays |= {"reward": episode.rewards, "terminated": np.array(episode.terminated)}
         part = demos.path / f".{INDEX}.part"

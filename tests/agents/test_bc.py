@@ -14,7 +14,7 @@ def test_the_loss_is_the_squared_error_on_the_demonstrations_alone() -> None:
     batch = Batch({}, action, zeros, zeros, {}, demos=2)
     mean = torch.zeros(3, 2, requires_grad=True)
     loss = cloning_loss(mean, batch)
-    assert float(loss) == 0.25  # of four numbers one is off by 1; the third sample does not count
+    assert loss.item() == 0.25  # of four numbers one is off by 1; the third sample does not count
     loss.backward()
     assert mean.grad is not None
     assert mean.grad.tolist() == [[-0.5, 0.0], [0.0, 0.0], [0.0, 0.0]]

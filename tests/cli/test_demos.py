@@ -13,8 +13,8 @@ from safetensors.torch import load_file
 
 from helpers import flat
 from merl.cli import main
+from merl.demos.demonstrations import Demonstrations
 from merl.evaluation.demonstrating import record_episodes
-from merl.runs.demonstrations import Demonstrations
 from toy import DotEnv
 
 TINY = ["--preset", "smoke", "--agent.keys", "proprio", "--eval.video", "none", "--threads", "1"]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError, Observation
 from merl.core.guards import check_finite
+from merl.demos.demonstrations import Episode
 from merl.evaluation.evaluation import Act
-from merl.runs.demonstrations import Episode
 
 ATTEMPTS = 5
 """Episodes that may be tried for each one that is wanted."""

@@ -25,11 +25,11 @@ from merl.agents.networks import make_networks, user_encoders
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import Agent, MerlError, counted, user_code
 from merl.core.resources import available_memory, keep_freed_memory
+from merl.demos.demonstrations import Demonstrations
 from merl.envs.user_env import MakeEnv, load_module
 from merl.evaluation.video import MIN_SIDE
 from merl.replay import ReplayBuffer, ReplaySpec, check_fits
 from merl.replay.mixing import MixedReplay
-from merl.runs.demonstrations import Demonstrations
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
 from merl.training.loop import Progress, Randomness

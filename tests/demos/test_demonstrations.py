@@ -11,8 +11,9 @@ import pytest
 from gymnasium import spaces
 
 from merl.core import MerlError
+from merl.demos.demonstrations import Demonstrations, Episode
+from merl.demos.recorder import Recorder
 from merl.replay import ReplayConfig
-from merl.runs.demonstrations import Demonstrations, Episode, Recorder
 
 OBSERVATION = spaces.Dict(
     {

@@ -14,7 +14,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ from merl.runs.plain import box, describe, told
 
 INDEX = "demos.json"
 FORMAT = 1
-_KEY = "observation/"
+KEY = "observation/"
+"""Precedes the keys of an observation in an episode's archive."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ class Demonstrations:
         try:
             with np.load(file, allow_pickle=False) as arrays:
                 found = {name: arrays[name] for name in arrays.files}
-            observations = {key: found[_KEY + key] for key in self.observation_space}
+            observations = {key: found[KEY + key] for key in self.observation_space}
             actions, intended, rewards = found["action"], found["intended"], found["reward"]
             terminated = bool(found["terminated"])
         except (
@@ -253,66 +254,6 @@ class Demonstrations:
         return replay
 
 
-class Recorder:
-    """Writer of a folder of demonstrations; the folder is complete after every episode.
-
-    Args:
-        path: the folder, which must not exist or be empty.
-        task: the task.
-        source: who acts.
-        observation_space, action_space: spaces of the environment.
-        options: options of the task, if it is one of merl's.
-
-    Raises:
-        MerlError: the folder holds files, or cannot be created.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        task: str,
-        source: str,
-        observation_space: spaces.Dict,
-        action_space: spaces.Box,
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            if any(path.iterdir()):
-                raise MerlError(f"{path} is not empty: name another folder with --out")
-        except OSError as error:
-            raise MerlError(f"{path} cannot be created: {error.strerror}") from None
-        self.demonstrations = Demonstrations(
-            path, task, source, observation_space, action_space, (), options or {}
-        )
-
-    def add(self, episode: Episode) -> None:
-        """Write an episode.
-
-        Raises:
-            MerlError: it cannot be written.
-        """
-        demos = self.demonstrations
-        name = f"{len(demos.lines):05}.npz"
-        returned = float(np.sum(episode.rewards, dtype=np.float64))
-        line = Line(name, len(episode), returned, episode.success)
-        whole = replace(demos, lines=(*demos.lines, line))
-        arrays: dict[str, Any] = {  # in the type of the space, as they are checked when read
-            _KEY + key: np.asarray(episode.observations[key], space.dtype)
-            for key, space in demos.observation_space.spaces.items()
-        }
-        arrays |= {"action": episode.actions, "intended": episode.intended}
-        arrays |= {"reward": episode.rewards, "terminated": np.array(episode.terminated)}
-        part = demos.path / f".{INDEX}.part"
-        try:
-            np.savez_compressed(demos.path / name, **arrays)
-            part.write_text(json.dumps(_index(whole), indent=1) + "\n")
-            part.replace(demos.path / INDEX)
-        except OSError as error:
-            raise MerlError(f"{demos.path} cannot be written: {error.strerror}") from None
-        self.demonstrations = whole
-
-
 def _line(values: Any) -> Line:
     """Return a line of the index.
 
@@ -326,15 +267,3 @@ def _line(values: Any) -> Line:
     if not (line.success is None or isinstance(line.success, bool)):
         raise TypeError(f"the line {values}")
     return line
-
-
-def _index(demos: Demonstrations) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "task": demos.task,
-        "source": demos.source,
-        "options": dict(demos.options),
-        "observation_space": {k: describe(s) for k, s in demos.observation_space.items()},
-        "action_space": describe(demos.action_space),
-        "episodes": [asdict(line) for line in demos.lines],
-    }

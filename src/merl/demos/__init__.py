@@ -1,0 +1,1 @@
+"""Demonstrations: recorded episodes, and their conversion from and to other formats."""

@@ -1,0 +1,330 @@
+"""Import of demonstrations from the formats of other projects, with a check against an environment.
+
+Nothing is written unless every episode fits.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from PIL import Image
+
+from merl.core import MerlError, counted, suggest
+from merl.demos.demonstrations import Demonstrations, Episode
+from merl.demos.lerobot_reader import INFO, LeRobotDataset
+from merl.demos.lerobot_writer import lerobot_name, write_lerobot
+from merl.demos.minari_data import MinariData, write_minari
+from merl.demos.recorder import Recorder
+from merl.demos.robomimic import RobomimicFile, write_robomimic
+from merl.demos.source import Feature, RawEpisode, Source
+
+Format = Literal["lerobot", "robomimic", "minari"]
+Actions = Literal["unit", "env"]
+RATE_TOLERANCE = 0.01
+"""Relative difference of two rates that still count as equal."""
+ROUNDING = 1e-4
+"""Distance of an action from [-1, 1] that still counts as rounding."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """The environment that demonstrations are imported for.
+
+    Attributes:
+        task: its name.
+        observation_space, action_space: its spaces, in the form that agents use.
+        bounds: lower and upper bounds of the actions in its own units; None if they are [-1, 1].
+        rate: timesteps in a second; None if it is not known.
+    """
+
+    task: str
+    observation_space: spaces.Dict
+    action_space: spaces.Box
+    bounds: tuple[list[float], list[float]] | None
+    rate: float | None
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How values of a source become those of an environment.
+
+    Attributes:
+        keys: {key of the environment: feature of the source}; a key that is left out takes the
+            feature of its name.
+        actions: the source's actions are in [-1, 1] (`unit`), or in the environment's own units
+            (`env`).
+        clip: clip actions beyond the bounds; otherwise they are an error.
+        resize: resize images that have another size.
+        any_rate: accept another rate than the environment's.
+    """
+
+    keys: Mapping[str, str] = field(default_factory=dict)
+    actions: Actions = "unit"
+    clip: bool = False
+    resize: bool = False
+    any_rate: bool = False
+
+
+def open_source(path: Path) -> Source:
+    """Open a folder or file in one of the formats, which its content shows.
+
+    Raises:
+        MerlError: it is in none of them, or damaged.
+    """
+    if (path / INFO).is_file():
+        return LeRobotDataset(path)
+    if (path / "data").is_dir() and (path / "data" / "metadata.json").is_file():
+        return MinariData(path)
+    if path.is_file():
+        return RobomimicFile(path)
+    if not path.exists():
+        raise MerlError(f"{path} does not exist")
+    raise MerlError(
+        f"{path} is neither a LeRobotDataset v3 (it has no {INFO}), nor a dataset of Minari (it "
+        "has no data/metadata.json), nor an HDF5 file of robomimic"
+    )
+
+
+def import_demos(source: Source, out: Path, target: Target, rules: Rules) -> Demonstrations:
+    """Convert all episodes of a source to demonstrations for an environment.
+
+    Args:
+        source: the source.
+        out: folder of the demonstrations, which must not exist or be empty.
+        target: the environment.
+        rules: how to convert.
+
+    Raises:
+        MerlError: the source does not fit the environment or is damaged; nothing is written.
+    """
+    keys = matched(source, target, rules)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise MerlError(f"{out} is not empty: name another folder with --out")
+    part = out.with_name(f".{out.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    made = f"{source.format} {source.path.name}"
+    try:
+        recorder = Recorder(part, target.task, made, target.observation_space, target.action_space)
+        for raw in source.episodes(tuple(dict.fromkeys(keys.values()))):
+            recorder.add(converted(raw, source, keys, target, rules))
+        if out.exists():
+            out.rmdir()
+        part.replace(out)
+    except OSError as error:
+        raise MerlError(f"{out} cannot be written: {error.strerror}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return Demonstrations.open(out)
+
+
+def matched(source: Source, target: Target, rules: Rules) -> dict[str, str]:
+    """Return the feature for each key of the environment, checked.
+
+    Raises:
+        MerlError: a feature is missing or does not fit, or the actions or the rate differ.
+    """
+    given = target.observation_space.spaces
+    for key in rules.keys:
+        if key not in given:
+            raise MerlError(
+                f"--keys names {key!r}, but the environment has {', '.join(given)}: "
+                f"{suggest(key, tuple(given))}"
+            )
+    keys = {}
+    for key, space in given.items():
+        keys[key] = name = rules.keys.get(key) or _name_of(key, source)
+        if name not in source.features:
+            have = ", ".join(source.features)
+            raise MerlError(
+                f"{source.path} has no feature {name!r} for observation {key!r}: it has {have}; "
+                f"name one with --keys {key}=FEATURE"
+            )
+        _check_feature(source, key, name, space, rules)
+    if source.action_size != target.action_space.shape[0]:
+        raise MerlError(
+            f"{source.path}: an action has {counted(source.action_size, 'number')}, and "
+            f"{target.task} takes {target.action_space.shape[0]}"
+        )
+    both = source.rate, target.rate
+    if None not in both and not rules.any_rate:
+        assert source.rate is not None
+        assert target.rate is not None
+        if abs(source.rate / target.rate - 1.0) > RATE_TOLERANCE:
+            raise MerlError(
+                f"{source.path} has {source.rate:g} steps per second, and {target.task} has "
+                f"{target.rate:g}: a step would mean another time; import them all the same with "
+                "--any-rate"
+            )
+    return keys
+
+
+def converted(
+    raw: RawEpisode, source: Source, keys: Mapping[str, str], target: Target, rules: Rules
+) -> Episode:
+    """Return an episode of a source as an episode of the environment.
+
+    Without the observation after the last action, that before it is repeated. Without rewards, the
+    reward is 1 at the last step of an episode that does not end in failure, else 0.
+
+    Raises:
+        MerlError: a value does not fit.
+    """
+    where = f"{source.path}, {raw.name}"
+    steps = len(raw.actions)
+    if not steps:
+        raise MerlError(f"{where} has no step")
+    observations = {}
+    for key, name in keys.items():
+        space, value = target.observation_space[key], raw.observations[name]
+        if len(value) not in (steps, steps + 1):
+            raise MerlError(f"{where}: {name!r} has {len(value)} values, and {steps} actions")
+        value = _fitted(f"{where}: {name!r}", value, space)
+        observations[key] = value if len(value) > steps else np.concatenate([value, value[-1:]])
+    actions = _scaled(where, raw.actions, target, rules)
+    rewards = raw.rewards
+    if rewards is None:
+        rewards = np.zeros(steps, np.float32)
+        rewards[-1] = raw.success is not False
+    intended = actions if raw.intended is None else _scaled(where, raw.intended, target, rules)
+    episode = Episode(
+        observations,
+        actions,
+        intended,
+        rewards.astype(np.float32),
+        bool(raw.terminated),
+        raw.success,
+    )
+    numbers = [*observations.values(), episode.actions, episode.intended, episode.rewards]
+    if any(each.dtype.kind == "f" and not np.isfinite(each).all() for each in numbers):
+        raise MerlError(f"{where} contains NaN or infinity")
+    if len(rewards) != steps:
+        raise MerlError(f"{where} has {len(rewards)} rewards and {steps} actions")
+    return episode
+
+
+def export_demos(
+    demos: Demonstrations, form: Format, out: Path, rate: float | None, *, lossless: bool = False
+) -> None:
+    """Write demonstrations in the format of another project.
+
+    Args:
+        demos: the demonstrations.
+        form: the format.
+        out: the folder, or robomimic's file; it must not exist.
+        rate: timesteps in a second.
+        lossless: store images without loss in LeRobot's format too.
+
+    Raises:
+        MerlError: they do not fit the format, or cannot be read or written; nothing is written.
+    """
+    if not demos.lines:
+        raise MerlError(f"{demos.path} holds no episode")
+    if out.exists():
+        raise MerlError(f"{out} exists: name another with --out")
+    if form == "lerobot" and rate is None:
+        raise MerlError("LeRobotDataset needs the steps per second: give them with --rate")
+    part = out.with_name(f".{out.name}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        _remove(part)
+        if form != "robomimic":
+            part.mkdir()
+        if form == "lerobot":
+            assert rate is not None
+            write_lerobot(demos, part, rate, lossless=lossless)
+        elif form == "minari":
+            write_minari(demos, part)
+        else:
+            write_robomimic(demos, part, rate)
+        part.replace(out)
+    except OSError as error:
+        raise MerlError(f"{out} cannot be written: {error.strerror or error}") from None
+    finally:
+        _remove(part)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _name_of(key: str, source: Source) -> str:
+    """Return the feature that has a key's name, in merl's spelling or in LeRobot's."""
+    names = (lerobot_name(key, image=True), lerobot_name(key, image=False), key)
+    return next((name for name in names if name in source.features), key)
+
+
+def _check_feature(
+    source: Source, key: str, name: str, space: spaces.Space[Any], rules: Rules
+) -> None:
+    feature, shape = source.features[name], space.shape or ()
+    fits = _flat(feature.shape) == _flat(shape)
+    image = space.dtype == np.uint8
+    if fits and (feature.dtype == "uint8") == image:
+        return
+    told = f"{source.path}: feature {name!r} is {feature}, and observation {key!r} is " + str(
+        Feature(shape, str(space.dtype))
+    )
+    if image and feature.image and feature.shape[2:] == shape[2:]:
+        if rules.resize:
+            return
+        raise MerlError(f"{told}: resize its images with --resize")
+    raise MerlError(f"{told}: name another with --keys {key}=FEATURE")
+
+
+def _flat(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return a shape without axes of one: () and (1,), (n,) and (n, 1) hold the same."""
+    return tuple(size for size in shape if size != 1)
+
+
+def _fitted(what: str, value: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
+    """Return values with shape and type of a space, checked against its bounds."""
+    assert isinstance(space, spaces.Box)
+    if value.shape[1:] != space.shape:
+        if value.ndim == 4 and value.dtype == np.uint8:
+            height, width = space.shape[:2]
+            value = np.stack([_resized(frame, height, width) for frame in value])
+        value = value.reshape(len(value), *space.shape)
+    value = value.astype(space.dtype, copy=False)
+    below, above = (value < space.low).any(), (value > space.high).any()
+    if below or above:
+        worst = value.min() if below else value.max()
+        raise MerlError(
+            f"{what} is {worst:g} somewhere, which is outside of the observation's bounds, "
+            f"[{space.low.min():g}, {space.high.max():g}]: its unit differs"
+        )
+    return value
+
+
+def _resized(frame: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """Return a frame (H, W, C) of another size; each pixel is the mean of those that it covers."""
+    image = Image.fromarray(frame.squeeze(-1) if frame.shape[-1] == 1 else frame)
+    found = np.asarray(image.resize((width, height), Image.Resampling.BOX))
+    return found.reshape(height, width, frame.shape[-1])
+
+
+def _scaled(where: str, actions: NDArray[Any], target: Target, rules: Rules) -> NDArray[np.float32]:
+    """Return actions in [-1, 1]."""
+    values = actions.astype(np.float64)
+    if rules.actions == "env" and target.bounds is not None:
+        low, high = (np.asarray(bound, np.float64) for bound in target.bounds)
+        values = 2.0 * (values - low) / (high - low) - 1.0
+    beyond = np.abs(values) > 1.0 + ROUNDING
+    if beyond.any() and not rules.clip:
+        step, index = np.argwhere(beyond)[0]
+        units = "in the environment's own units" if rules.actions == "env" else "in [-1, 1]"
+        other = "unit" if rules.actions == "env" else "env"
+        raise MerlError(
+            f"{where}: number {index} of action {step} is {actions[step, index]:g}, which is not "
+            f"{units}: use --actions {other}, or cut such actions off with --clip"
+        )
+    return np.clip(values, -1.0, 1.0).astype(np.float32)

@@ -1,0 +1,88 @@
+"""Writer of a folder of demonstrations."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from merl.core import MerlError
+from merl.demos.demonstrations import FORMAT, INDEX, KEY, Demonstrations, Episode, Line
+from merl.runs.plain import describe
+
+
+class Recorder:
+    """Writer of a folder of demonstrations; the folder is complete after every episode.
+
+    Args:
+        path: the folder, which must not exist or be empty.
+        task: the task.
+        source: who acts.
+        observation_space, action_space: spaces of the environment.
+        options: options of the task, if it is one of merl's.
+
+    Raises:
+        MerlError: the folder holds files, or cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        task: str,
+        source: str,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            if any(path.iterdir()):
+                raise MerlError(f"{path} is not empty: name another folder with --out")
+        except OSError as error:
+            raise MerlError(f"{path} cannot be created: {error.strerror}") from None
+        self.demonstrations = Demonstrations(
+            path, task, source, observation_space, action_space, (), options or {}
+        )
+
+    def add(self, episode: Episode) -> None:
+        """Write an episode.
+
+        Raises:
+            MerlError: it cannot be written.
+        """
+        demos = self.demonstrations
+        name = f"{len(demos.lines):05}.npz"
+        returned = float(np.sum(episode.rewards, dtype=np.float64))
+        line = Line(name, len(episode), returned, episode.success)
+        whole = replace(demos, lines=(*demos.lines, line))
+        arrays: dict[str, Any] = {  # in the type of the space, as they are checked when read
+            KEY + key: np.asarray(episode.observations[key], space.dtype)
+            for key, space in demos.observation_space.spaces.items()
+        }
+        arrays |= {"action": episode.actions, "intended": episode.intended}
+        arrays |= {"reward": episode.rewards, "terminated": np.array(episode.terminated)}
+        part = demos.path / f".{INDEX}.part"
+        try:
+            np.savez_compressed(demos.path / name, **arrays)
+            part.write_text(json.dumps(_index(whole), indent=1) + "\n")
+            part.replace(demos.path / INDEX)
+        except OSError as error:
+            raise MerlError(f"{demos.path} cannot be written: {error.strerror}") from None
+        self.demonstrations = whole
+
+
+def _index(demos: Demonstrations) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "task": demos.task,
+        "source": demos.source,
+        "options": dict(demos.options),
+        "observation_space": {k: describe(s) for k, s in demos.observation_space.items()},
+        "action_space": describe(demos.action_space),
+        "episodes": [asdict(line) for line in demos.lines],
+    }

@@ -17,7 +17,8 @@ from pyarrow import parquet
 
 from merl.core import MerlError
 from merl.demos.conversion import Format, Rules, Target, export_demos, import_demos, open_source
-from merl.demos.demonstrations import Demonstrations, Episode
+from merl.demos.demonstrations import Demonstrations
+from merl.demos.episode import Episode
 from merl.demos.recorder import Recorder
 
 OBSERVATION = spaces.Dict(

@@ -11,7 +11,8 @@ import pytest
 from gymnasium import spaces
 
 from merl.core import MerlError
-from merl.demos.demonstrations import Demonstrations, Episode
+from merl.demos.demonstrations import Demonstrations
+from merl.demos.episode import Episode
 from merl.demos.recorder import Recorder
 from merl.replay import ReplayConfig
 

@@ -12,7 +12,8 @@ from rich.filesize import decimal
 from merl.cli.output import make_console
 from merl.cli.parsing import RunOptions, check_writable, parse
 from merl.cli.running import tell_trusted
-from merl.evaluation.export import SUFFIXES, Form, export_policy
+from merl.evaluation.export import export_policy
+from merl.evaluation.exported import SUFFIXES, Form
 from merl.evaluation.policy import load_policy
 from merl.runs.run import Run
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from merl.core import MerlError, counted, suggest
-from merl.demos.demonstrations import Demonstrations, Episode
+from merl.demos.demonstrations import Demonstrations
+from merl.demos.episode import Episode
 from merl.demos.lerobot_reader import INFO, LeRobotDataset
 from merl.demos.lerobot_writer import lerobot_name, write_lerobot
 from merl.demos.minari_data import MinariData, write_minari

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from merl.core import MerlError, Transition, counted
+from merl.demos.episode import Episode
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.runs.plain import box, describe, told
 
@@ -30,31 +30,6 @@ INDEX = "demos.json"
 FORMAT = 1
 KEY = "observation/"
 """Precedes the keys of an observation in an episode's archive."""
-
-
-@dataclass(frozen=True)
-class Episode:
-    """A recorded episode.
-
-    Attributes:
-        observations: {key: (T + 1, ...)}, as the environment returned them.
-        actions: (T, A), float32, in [-1, 1], as they were executed.
-        intended: the actions without the noise that was added to them, in the same form.
-        rewards: (T,), float32.
-        terminated: whether it ended by termination, not by a time limit.
-        success: whether it was solved at its last step; None if the environment does not say.
-    """
-
-    observations: Mapping[str, NDArray[Any]]
-    actions: NDArray[np.float32]
-    intended: NDArray[np.float32]
-    rewards: NDArray[np.float32]
-    terminated: bool
-    success: bool | None
-
-    def __len__(self) -> int:
-        """Return the number of steps."""
-        return len(self.actions)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from merl.core import MerlError
-from merl.demos.demonstrations import Demonstrations, Episode
+from merl.demos.demonstrations import Demonstrations
+from merl.demos.episode import Episode
 from merl.demos.lerobot_reader import (
     ACTION,
     DONE,
@@ -164,16 +165,19 @@ class _Writer:
         from pyarrow import parquet
 
         parquet.write_table(pyarrow.Table.from_pylist(rows), self._path(EPISODES))
-        task = pyarrow.table({"task_index": [0], "__index_level_0__": [self.demos.task]})
-        # LeRobot looks a task up by the index of a pandas table.
-        index = {
-            "index_columns": ["__index_level_0__"],
+        tasks = pyarrow.table({"task_index": [0], "task": [self.demos.task]})
+        # LeRobot looks a task up by its name, the index of a pandas table.
+        told = {
+            "index_columns": ["task"],
             "column_indexes": [],
-            "columns": [],
+            "columns": [
+                _pandas("task_index", "int64", "int64"),
+                _pandas("task", "unicode", "object"),
+            ],
             "pandas_version": "2.0.0",
         }
-        task = task.replace_schema_metadata({"pandas": json.dumps(index)})
-        parquet.write_table(task, self._path("meta/tasks.parquet"))
+        tasks = tasks.replace_schema_metadata({"pandas": json.dumps(told)})
+        parquet.write_table(tasks, self._path("meta/tasks.parquet"))
         info = {
             "codebase_version": "v3.0",
             "robot_type": None,
@@ -190,12 +194,13 @@ class _Writer:
             "features": self.features,
         }
         self._path(INFO).write_text(json.dumps(info, indent=4) + "\n")
-        told = {name: _statistics(np.concatenate(parts)) for name, parts in values.items()}
-        for name, each in told.items():
+        statistics: dict[str, Any] = {}
+        for name, parts in values.items():
+            found: dict[str, Any] = _statistics(np.concatenate(parts))
             if self._kind(name) in ("image", "video"):
-                told[name] = {k: v if k == "count" else _by_channel(v) for k, v in each.items()}
-            each["count"] = [frames]
-        self._path("meta/stats.json").write_text(json.dumps(told, indent=4) + "\n")
+                found = {key: _by_channel(value) for key, value in found.items()}
+            statistics[name] = found | {"count": [frames]}
+        self._path("meta/stats.json").write_text(json.dumps(statistics, indent=4) + "\n")
 
     def _values(self, episode: Episode, index: int, first: int) -> dict[str, NDArray[Any]]:
         """Return the value of each feature at each timestep."""
@@ -315,6 +320,17 @@ def _close(tables: Any, videos: Mapping[str, _Video]) -> None:
         tables.close()
     for video in videos.values():
         video.close()
+
+
+def _pandas(name: str, kind: str, numpy: str) -> dict[str, Any]:
+    """Return how pandas describes a column."""
+    return {
+        "name": name,
+        "field_name": name,
+        "pandas_type": kind,
+        "numpy_type": numpy,
+        "metadata": None,
+    }
 
 
 def _numbers(kind: str, shape: tuple[int, ...]) -> dict[str, Any]:

@@ -12,7 +12,8 @@ import numpy as np
 from gymnasium import spaces
 
 from merl.core import MerlError
-from merl.demos.demonstrations import FORMAT, INDEX, KEY, Demonstrations, Episode, Line
+from merl.demos.demonstrations import FORMAT, INDEX, KEY, Demonstrations, Line
+from merl.demos.episode import Episode
 from merl.runs.plain import describe
 
 

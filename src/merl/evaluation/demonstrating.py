@@ -7,11 +7,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
-from merl.core import MerlError, Observation
+from merl.core import MerlError
 from merl.core.guards import check_finite
-from merl.demos.demonstrations import Episode
+from merl.demos.episode import Episode, EpisodeRecording
 from merl.evaluation.evaluation import Act
 
 ATTEMPTS = 5
@@ -66,33 +65,14 @@ def _episode(
     rng = np.random.default_rng(seed)
     observation, _ = env.reset(seed=seed)
     reset()
-    seen, rewards = [_copied(observation)], list[float]()
-    actions: list[NDArray[np.float32]] = []
-    intended: list[NDArray[np.float32]] = []
+    recording = EpisodeRecording(observation)
     terminated = truncated = False
-    success: bool | None = None
     while not (terminated or truncated):
-        action = np.asarray(act(observation), np.float32).clip(-1.0, 1.0)
-        intended.append(action)
+        intended = action = np.asarray(act(observation), np.float32).clip(-1.0, 1.0)
         if noise:
             action = action + rng.normal(0.0, noise, action.shape).astype(np.float32)
         action = action.clip(-1.0, 1.0)
         observation, reward, terminated, truncated, info = env.step(action)
-        check_finite(observation, float(reward), len(actions) + 1)
-        seen.append(_copied(observation))
-        actions.append(action)
-        rewards.append(float(reward))
-        success = bool(info["success"]) if "success" in info else success
-    return Episode(
-        {key: np.stack([each[key] for each in seen]) for key in seen[0]},
-        np.stack(actions),
-        np.stack(intended),
-        np.array(rewards, np.float32),
-        terminated,
-        success,
-    )
-
-
-def _copied(observation: Observation) -> dict[str, NDArray[Any]]:
-    """Return a copy: an environment may write the next observation into the same arrays."""
-    return {key: np.array(value) for key, value in observation.items()}
+        check_finite(observation, float(reward), len(recording) + 1)
+        recording.add(action, intended, observation, float(reward), info)
+    return recording.finish(terminated=bool(terminated))

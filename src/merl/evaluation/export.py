@@ -12,10 +12,10 @@ import json
 import logging
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -25,21 +25,12 @@ from torch import Tensor, nn
 import merl
 from merl.agents.ddpg import DDPG
 from merl.core import MerlError, check_choice
+from merl.evaluation.exported import FORMER, NEXT, Form, Run, Values, card_of, load_exported
 from merl.evaluation.policy import Policy
 from merl.runs import record
 
-Form = Literal["onnx", "torch"]
-SUFFIXES: dict[Form, str] = {"onnx": ".onnx", "torch": ".pt2"}
-FORMER = "_former"
-"""Ending of the inputs with the former frames of a camera."""
-NEXT = "_next"
-"""Ending of the outputs with the former frames for the next step."""
 CALLS = 200
 """Calls of the latency's measurement."""
-
-Values = Mapping[str, NDArray[Any]]
-Run = Callable[[Values], dict[str, NDArray[Any]]]
-"""The exported function: from inputs by name to outputs by name."""
 
 
 class Deployed(nn.Module):
@@ -137,7 +128,7 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
             "former_frames": "at the start of an episode, copies of the first frame",
             "milliseconds": _latency(run, example),
         }
-        output.with_name(f"{output.name}.json").write_text(json.dumps(card, indent=1) + "\n")
+        card_of(output).write_text(json.dumps(card, indent=1) + "\n")
     except OSError as error:
         raise MerlError(f"{output} cannot be written: {error.strerror}") from None
     finally:
@@ -183,29 +174,6 @@ def _write_onnx(
     )
     assert program is not None
     program.save(str(output), external_data=False)
-
-
-def load_exported(path: Path, names: list[str], outputs: list[str]) -> Run:
-    """Load an exported policy; return it as a function from inputs by name to outputs by name."""
-    if path.suffix == SUFFIXES["onnx"]:
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        session = onnxruntime.InferenceSession(
-            str(path), options, providers=["CPUExecutionProvider"]
-        )
-        return lambda values: dict(
-            zip(outputs, session.run(outputs, {name: values[name] for name in names}), strict=True)
-        )
-    module = torch.export.load(path).module()
-
-    def run(values: Values) -> dict[str, NDArray[Any]]:
-        with torch.inference_mode():
-            found = module(*(torch.from_numpy(values[name]) for name in names))
-        return {name: value.numpy() for name, value in zip(outputs, found, strict=True)}
-
-    return run
 
 
 def inputs_of(policy: Policy, seed: int) -> dict[str, NDArray[Any]]:

@@ -1,0 +1,97 @@
+"""An episode that was recorded, and the recording of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merl.core import Observation
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A recorded episode.
+
+    Attributes:
+        observations: {key: (T + 1, ...)}, as the environment returned them.
+        actions: (T, A), float32, in [-1, 1], as they were executed.
+        intended: the actions without the noise that was added to them, in the same form.
+        rewards: (T,), float32.
+        terminated: whether it ended by termination, not by a time limit.
+        success: whether it was solved at its last step; None if the environment does not say.
+    """
+
+    observations: Mapping[str, NDArray[Any]]
+    actions: NDArray[np.float32]
+    intended: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    terminated: bool
+    success: bool | None
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.actions)
+
+
+class EpisodeRecording:
+    """An episode while it is recorded.
+
+    Args:
+        observation: the observation after the reset.
+    """
+
+    def __init__(self, observation: Observation) -> None:
+        self._observations = [_copied(observation)]
+        self._actions: list[NDArray[np.float32]] = []
+        self._intended: list[NDArray[np.float32]] = []
+        self._rewards: list[float] = []
+        self._success: bool | None = None
+
+    def __len__(self) -> int:
+        """Return the number of steps so far."""
+        return len(self._rewards)
+
+    def add(
+        self,
+        action: NDArray[np.float32],
+        intended: NDArray[np.float32],
+        observation: Observation,
+        reward: float,
+        info: Mapping[str, Any],
+    ) -> None:
+        """Append a step.
+
+        Args:
+            action: the executed action.
+            intended: the action before noise or limits.
+            observation: the observation after the step.
+            reward: the reward of the step.
+            info: the environment's, of which `success` is kept.
+        """
+        self._observations.append(_copied(observation))
+        self._actions.append(action)
+        self._intended.append(intended)
+        self._rewards.append(reward)
+        if "success" in info:
+            self._success = bool(info["success"])
+
+    def finish(self, *, terminated: bool) -> Episode:
+        """Return the episode, which has at least one step."""
+        keys = self._observations[0]
+        return Episode(
+            {key: np.stack([each[key] for each in self._observations]) for key in keys},
+            np.stack(self._actions),
+            np.stack(self._intended),
+            np.array(self._rewards, np.float32),
+            terminated,
+            self._success,
+        )
+
+
+def _copied(observation: Observation) -> dict[str, NDArray[Any]]:
+    """Return a copy: an environment may write the next observation into the same arrays."""
+    return {key: np.array(value) for key, value in observation.items()}

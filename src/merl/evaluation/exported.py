@@ -1,0 +1,142 @@
+"""A policy that was exported to one file: read it, and act with it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merl.core import MerlError, NotFinite, Observation
+from merl.core.user_code import in_one_line
+
+Form = Literal["onnx", "torch"]
+SUFFIXES: dict[Form, str] = {"onnx": ".onnx", "torch": ".pt2"}
+FORMER = "_former"
+"""Ending of the inputs with the former frames of a camera."""
+NEXT = "_next"
+"""Ending of the outputs with the former frames for the next step."""
+Values = Mapping[str, NDArray[Any]]
+Run = Callable[[Values], dict[str, NDArray[Any]]]
+"""The exported function: from inputs by name to outputs by name."""
+
+
+class ExportedPolicy:
+    """An exported policy that acts on single observations; it keeps the former frames itself.
+
+    Call `reset()` at the start of each episode, then call the policy with each observation.
+
+    Args:
+        path: the file, beside its card.
+
+    Attributes:
+        card: what the card says.
+        inputs: type and shape of each observation.
+
+    Raises:
+        MerlError: the file or its card is missing or damaged, or one is of another policy.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.card = _card(path)
+        try:
+            names, outputs = list(self.card["inputs"]), list(self.card["outputs"])
+            low, high = (np.asarray(b, np.float32) for b in self.card["action_bounds"])
+            told = {
+                name: (np.dtype(each["dtype"]), tuple(each["shape"]))
+                for name, each in self.card["inputs"].items()
+            }
+        except (KeyError, TypeError, ValueError) as error:
+            raise MerlError(f"{card_of(path)} is damaged: {error!r}") from None
+        self.inputs = {name: each for name, each in told.items() if not name.endswith(FORMER)}
+        self._former = {name: each for name, each in told.items() if name.endswith(FORMER)}
+        self._low, self._high = low, high
+        try:
+            self._run = load_exported(path, names, outputs)
+            self._run({name: np.zeros(shape, kind) for name, (kind, shape) in told.items()})
+        except Exception as error:  # from ONNX Runtime or torch
+            raise MerlError(
+                f"{path} cannot be run as its card says: {in_one_line(error)}: export it again"
+            ) from None
+        self._frames: dict[str, NDArray[Any]] = {}
+
+    def reset(self) -> None:
+        """Start a new episode: discard the former frames."""
+        self._frames = {}
+
+    def __call__(self, observation: Observation) -> NDArray[np.float32]:
+        """Return the action for an observation, in [-1, 1], as `Policy` does.
+
+        Raises:
+            MerlError: a key is missing, or has another shape or type.
+            NotFinite: the observation contains NaN or infinity.
+        """
+        values = {}
+        for name, (kind, shape) in self.inputs.items():
+            if name not in observation:
+                raise MerlError(f"the observation lacks {name!r}: it needs {list(self.inputs)}")
+            value = np.asarray(observation[name])
+            if value.dtype != kind or value.shape != shape:
+                raise MerlError(
+                    f"observation {name!r} is {value.dtype} {value.shape}, not {kind} {shape}"
+                )
+            if not np.isfinite(value).all():
+                raise NotFinite(f"observation {name!r} contains NaN or infinity")
+            values[name] = value
+        for name, (_, shape) in self._former.items():
+            frame = values[name.removesuffix(FORMER)]
+            values[name] = self._frames.get(name, np.broadcast_to(frame, shape).copy())
+        found = self._run(values)
+        for name in self._former:
+            self._frames[name] = found[name.removesuffix(FORMER) + NEXT]
+        action = 2.0 * (found["action"] - self._low) / (self._high - self._low) - 1.0
+        clipped: NDArray[np.float32] = action.clip(-1.0, 1.0).astype(np.float32)
+        return clipped
+
+
+def card_of(path: Path) -> Path:
+    """Return the file of a policy's card."""
+    return path.with_name(f"{path.name}.json")
+
+
+def _card(path: Path) -> dict[str, Any]:
+    file = card_of(path)
+    try:
+        card = json.loads(file.read_text())
+    except FileNotFoundError:
+        raise MerlError(f"{path} has no card {file.name} beside it: copy both files") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise MerlError(f"{file} cannot be read: {error}") from None
+    if not path.is_file():
+        raise MerlError(f"{path} does not exist")
+    if not isinstance(card, dict):
+        raise MerlError(f"{file} is damaged: it holds no object")
+    return card
+
+
+def load_exported(path: Path, names: list[str], outputs: list[str]) -> Run:
+    """Load an exported policy; return it as a function from inputs by name to outputs by name."""
+    if path.suffix == SUFFIXES["onnx"]:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        session = onnxruntime.InferenceSession(
+            str(path), options, providers=["CPUExecutionProvider"]
+        )
+        return lambda values: dict(
+            zip(outputs, session.run(outputs, {name: values[name] for name in names}), strict=True)
+        )
+    import torch
+
+    module = torch.export.load(path).module()
+
+    def run(values: Values) -> dict[str, NDArray[Any]]:
+        with torch.inference_mode():
+            found = module(*(torch.from_numpy(values[name]) for name in names))
+        return {name: value.numpy() for name, value in zip(outputs, found, strict=True)}
+
+    return run

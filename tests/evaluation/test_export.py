@@ -12,15 +12,9 @@ import torch
 
 import merl
 from merl.cli import main
-from merl.evaluation.export import (
-    FORMER,
-    NEXT,
-    Deployed,
-    Form,
-    export_policy,
-    inputs_of,
-    load_exported,
-)
+from merl.core import MerlError
+from merl.evaluation.export import Deployed, export_policy, inputs_of
+from merl.evaluation.exported import FORMER, NEXT, ExportedPolicy, Form, load_exported
 from merl.evaluation.policy import Policy
 
 PRETRAINED = "pretrained/reach_duplo"
@@ -150,3 +144,22 @@ def test_a_policy_on_bare_numbers_can_be_exported(tmp_path: Path) -> None:
     values = inputs_of(sac, 3)
     sac.reset()
     np.testing.assert_allclose(exported(values)["action"], sac(values), rtol=0, atol=1e-5)
+
+
+def test_as_an_object_it_keeps_the_frames_itself(
+    exported: tuple[Path, dict[str, Any]], policy: Policy
+) -> None:
+    again, env = ExportedPolicy(exported[0]), policy.make_env()
+    for seed in (1, 2):
+        observation, _ = env.reset(seed=seed)
+        policy.reset()
+        again.reset()
+        for _ in range(20):
+            action = policy(observation)
+            np.testing.assert_allclose(again(observation), action, rtol=0, atol=1e-5)
+            observation, *_ = env.step(action)
+    env.close()
+    with pytest.raises(MerlError, match="lacks 'image'"):
+        again({"proprio": observation["proprio"]})
+    with pytest.raises(MerlError, match=r"is float64 .*, not float32"):
+        again({**observation, "proprio": observation["proprio"].astype(float)})

@@ -27,6 +27,7 @@ COMMANDS = {
     "train": "train an agent on a task",
     "resume": "continue a run that was stopped",
     "evaluate": "run a trained policy, record a video",
+    "run": "run a trained policy in real time, e.g. on a robot",
     "export": "write a trained policy to an ONNX or torch file",
     "robustness": "evaluate a policy while its senses are disturbed",
     "demos": "record demonstrations, from which a run can learn",

@@ -1,0 +1,207 @@
+"""The command merl run."""
+
+from __future__ import annotations
+
+import select
+import sys
+import termios
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium
+import numpy as np
+import tyro
+from gymnasium import spaces
+from rich.console import Console
+
+from merl.cli.output import make_console
+from merl.cli.parsing import RunOptions, parse
+from merl.cli.running import tell_trusted
+from merl.core import MerlError, counted
+from merl.core.fields import Range
+from merl.core.signals import Interrupt
+from merl.demos.recorder import Recorder
+from merl.envs.frame_rate import frame_rate
+from merl.envs.user_env import load_module, make_user_env
+from merl.evaluation.exported import SUFFIXES, ExportedPolicy
+from merl.evaluation.policy import Policy, load_policy
+from merl.evaluation.realtime import Driven, Limits, check_rate, drive
+from merl.runs.run import Run
+
+STOP_KEYS = " q\x1b\r\n"
+"""Space, q, Escape and Enter."""
+
+
+@dataclass(frozen=True)
+class RunPolicyOptions(RunOptions):
+    """Run a policy in an environment in real time, e.g. on a robot. Space or Ctrl-C stops it."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    """A run's folder, or a file of `merl export`."""
+    env: Annotated[str | None, tyro.conf.arg(metavar="MODULE:FUNCTION")] = None
+    """The environment: module:function or a Gymnasium id; by default that of the run."""
+    hz: Annotated[float, Range(0, 10_000, without=0)] | None = None
+    """Steps per second; by default the environment's `render_fps`."""
+    episodes: Annotated[int, Range(1)] = 1
+    """Number of episodes; each begins with a reset of the environment."""
+    max_steps: Annotated[int, Range(1)] | None = None
+    """Steps of an episode; by default until the environment ends it."""
+    action_limit: Annotated[float, Range(0, 1, without=0)] = 1.0
+    """Largest absolute value of an action's numbers, of 1."""
+    rate_limit: Annotated[float, Range(0, 2, without=0)] | None = None
+    """Largest change of an action's numbers from step to step; the first counts from 0."""
+    max_late: Annotated[int, Range(1)] = 25
+    """Consecutive steps that miss their deadline, after which the run ends."""
+    log: Path | None = None
+    """Write the episodes to this new folder, which `merl demos show` and training can read."""
+    checkpoint: str = "latest"
+    """latest, best (the highest evaluation return), or the step of a checkpoint."""
+
+
+def run(args: list[str]) -> int:
+    """Run a policy in real time: merl run POLICY [--env MODULE:FUNCTION] [--hz RATE] ..."""
+    options = parse(RunPolicyOptions, "merl run", args)
+    console = make_console()
+    log = options.log and options.log.absolute()  # the environment may change the working folder
+    policy = _policy(options)
+    with ExitStack() as stack:
+        env = _env(options, policy)
+        stack.callback(env.close)
+        check_fits(policy, env)
+        rate = check_rate(options.hz or frame_rate(env.metadata))
+        limits = Limits(
+            options.action_limit, options.rate_limit, options.max_steps, options.max_late
+        )
+        name = options.env or _task(policy)
+        assert isinstance(env.observation_space, spaces.Dict)
+        assert isinstance(env.action_space, spaces.Box)
+        recorder = None
+        if log is not None:
+            who = f"policy {options.run}"
+            recorder = Recorder(log, name, who, env.observation_space, env.action_space)
+        policy(env.observation_space.sample())  # the first call takes longer
+        interrupt = stack.enter_context(Interrupt().listening())
+        pressed = stack.enter_context(key_pressed())
+        _tell(console, f"{options.run} in {name}, {rate:g} steps per second: Space or Ctrl-C stops")
+        stopped, code = False, 0
+        for index in range(options.episodes):
+            found = drive(
+                policy,
+                env,
+                rate,
+                limits,
+                lambda: interrupt.number is not None or pressed(),
+                reset=policy.reset,
+            )
+            if found is None:
+                _tell(console, "stopped before the first step")
+                break
+            if recorder is not None:
+                recorder.add(found.episode)
+            _tell(console, f"episode {index + 1}: {_told(found)}")
+            stopped = found.end == "stopped"
+            if found.end == "late":
+                message = f"{counted(options.max_late, 'step')} in a row missed the deadline"
+                _tell(console, f"stopped: {message}: use a lower --hz")
+                code = 1
+            if stopped or code:
+                break
+        if log is not None:
+            _tell(console, f"log: {log}")
+    return 128 + interrupt.number if interrupt.number is not None else code
+
+
+def check_fits(policy: Policy | ExportedPolicy, env: gymnasium.Env[Any, Any]) -> None:
+    """Check that an environment has what a policy observes, and takes its actions.
+
+    Raises:
+        MerlError: a key is missing or differs, or the actions have another length.
+    """
+    if isinstance(policy, ExportedPolicy):
+        wanted = policy.inputs
+        size = int(policy.card["outputs"]["action"]["shape"][0])
+    else:
+        wanted = {key: (np.dtype(m.space.dtype), m.shape) for key, m in policy.modalities.items()}
+        assert policy.run is not None
+        (size,) = policy.run.spaces()[1].shape
+    assert isinstance(env.observation_space, spaces.Dict)
+    for key, (kind, shape) in wanted.items():
+        space = env.observation_space.spaces.get(key)
+        if space is None:
+            raise MerlError(
+                f"the environment has no observation {key!r}, which the policy uses: it has "
+                f"{', '.join(env.observation_space.spaces)}"
+            )
+        if space.shape != shape or space.dtype != kind:
+            raise MerlError(
+                f"observation {key!r} of the environment is {space.dtype} {space.shape}, and the "
+                f"policy was trained with {kind} {shape}"
+            )
+    if env.action_space.shape != (size,):
+        raise MerlError(
+            f"the environment's actions are {env.action_space.shape}, and the policy's ({size},)"
+        )
+
+
+@contextmanager
+def key_pressed() -> Iterator[Callable[[], bool]]:
+    """Give a function that returns whether a stop key was pressed in the terminal."""
+    if not sys.stdin.isatty():
+        yield lambda: False
+        return
+    file = sys.stdin.fileno()
+    before = termios.tcgetattr(file)
+
+    def pressed() -> bool:
+        ready, _, _ = select.select([file], [], [], 0)
+        return bool(ready) and sys.stdin.read(1) in STOP_KEYS
+
+    try:
+        tty.setcbreak(file)
+        yield pressed
+    finally:
+        termios.tcsetattr(file, termios.TCSADRAIN, before)
+
+
+def _policy(options: RunPolicyOptions) -> Policy | ExportedPolicy:
+    if options.run.suffix in SUFFIXES.values():
+        return ExportedPolicy(options.run)
+    if options.trust:
+        tell_trusted(Run.open(options.run))
+    return load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+
+
+def _env(options: RunPolicyOptions, policy: Policy | ExportedPolicy) -> gymnasium.Env[Any, Any]:
+    if options.env is not None:
+        if ":" in options.env:
+            load_module(options.env, Path.cwd())
+        return make_user_env(options.env)
+    if isinstance(policy, ExportedPolicy):
+        raise MerlError(f"{options.run} is a file of a policy: name the environment with --env")
+    return policy.make_env(trust=options.trust)
+
+
+def _task(policy: Policy | ExportedPolicy) -> str:
+    assert isinstance(policy, Policy)
+    return policy.config.task
+
+
+def _tell(console: Console, line: str) -> None:
+    console.print(line, highlight=False, soft_wrap=True)
+
+
+def _told(found: Driven) -> str:
+    """Return one line about an episode: its return, its end, and its times."""
+    times, steps = found.timing, len(found.episode)
+    words = f"return {found.episode.rewards.sum():.4g} in {counted(steps, 'step')}, {found.end}"
+    if found.episode.success is not None:
+        words += ", success" if found.episode.success else ", no success"
+    for name, values in (("policy", times.policy), ("environment", times.env)):
+        middle, worst = 1000 * np.percentile(values, 50), 1000 * max(values)
+        words += f"; {name} {middle:.1f} ms (at most {worst:.1f})"
+    words += f"; {times.late} late"
+    return words + (f", by up to {1000 * max(times.lateness):.1f} ms" if times.late else "")

@@ -168,3 +168,32 @@ def test_bad_input_is_refused_in_one_line(
     assert message in error
     assert error.count("\n") == 1
     assert not any(tmp_path.iterdir())
+
+
+def test_an_exported_dataset_is_imported_and_learnt_from(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset, back = tmp_path / "dataset", tmp_path / "back"
+    assert main(["demos", "export", str(demos), "--to", "lerobot", "--out", str(dataset)]) == 0
+    assert "2 episodes, 500 steps" in flat(capsys.readouterr().out)
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    assert info["fps"] == 25  # a control step of the tasks is 0.04 s
+    given = ["demos", "import", "reach_duplo", "--preset", "smoke", "--from", str(dataset)]
+    assert main([*given, "--leave-out", "state", "--out", str(back)]) == 0
+    shown = flat(capsys.readouterr().out)
+    assert "the source compressed observation.images.image with loss" in shown
+    assert f"merl train reach_duplo --preset smoke --replay.demos {back}" in shown
+    assert list(Demonstrations.open(back).observation_space) == ["image", "proprio"]
+    train = ["train", "reach_duplo", *TINY, "--steps", "60", "--run-dir", str(tmp_path / "run")]
+    assert main([*train, "--eval.every", "0", "--replay.demos", str(back)]) == 0
+    capsys.readouterr()
+    assert main([*given, "--image-size", "24", "--out", str(tmp_path / "other")]) != 0
+    assert "resize its images with --resize" in flat(capsys.readouterr().err)
+    assert not (tmp_path / "other").exists()
+    assert main(["demos", "import", "reach_duplo", "--out", str(tmp_path / "other")]) != 0
+    assert "needs the folder or file to convert: --from PATH" in flat(capsys.readouterr().err)
+
+
+def test_another_environment_has_no_expert(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demos", "record", "Pendulum-v1"]) != 0
+    assert "there is no expert for Pendulum-v1" in flat(capsys.readouterr().err)

@@ -36,7 +36,7 @@ from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.envs.expert import ExpertPolicy
 from merl.envs.frame_rate import frame_rate
 from merl.envs.registration import ENV_IDS
-from merl.envs.user_env import make_user_env
+from merl.envs.user_env import check_task, make_user_env
 from merl.evaluation.demonstrating import record_episodes
 from merl.evaluation.policy import Policy, load_policy
 from merl.experiments.experiment import flags
@@ -184,6 +184,7 @@ def demos(args: list[str]) -> int:
 def record(args: list[str]) -> int:
     """Record demonstrations."""
     options, preset = _with_env(RecordOptions, "record", args)
+    check_task(options.task)
     own_task = options.task in ENV_IDS
     if options.source == EXPERT and not own_task:
         raise MerlError(
@@ -336,10 +337,10 @@ def _tell_line(console: Console, options: Any, preset: str) -> None:
     if options.task in ENV_IDS:
         usual = compose(preset, "reach_duplo").env
         for each in dataclasses.fields(EnvConfig):
-            value = getattr(options.env, each.name)
-            if each.name == "observations":  # `state` is used only where an agent names it
-                value = tuple(key for key in value if key != "state") or value
-            if value != getattr(usual, each.name):
+            value, before = getattr(options.env, each.name), getattr(usual, each.name)
+            if each.name == "observations":
+                before = (*before, "state")
+            if value != before:
                 given += flags(f"env.{each.name}", value)
     line = ["merl", "train", options.task, "--preset", preset, *given]
     line += ["--replay.demos", str(options.folder)]

@@ -14,7 +14,7 @@ import merl
 from merl.cli import main
 from merl.core import MerlError
 from merl.evaluation.export import Deployed, export_policy, inputs_of
-from merl.evaluation.exported import FORMER, NEXT, ExportedPolicy, Form, load_exported
+from merl.evaluation.exported import FORMER, NEXT, SUFFIXES, ExportedPolicy, Form, load_exported
 from merl.evaluation.policy import Policy
 
 PRETRAINED = "pretrained/reach_duplo"
@@ -26,14 +26,14 @@ def policy() -> Policy:
     return merl.load_policy(PRETRAINED)
 
 
-@pytest.fixture(scope="module", params=["onnx", "torch"])
+@pytest.fixture(scope="module", params=["onnx", "torch", "numpy"])
 def exported(
     request: pytest.FixtureRequest, policy: Policy, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, Any]]:
     form: Form = request.param
     if form == "onnx":
         pytest.importorskip("onnxruntime")
-    path = tmp_path_factory.mktemp("export") / ("p.onnx" if form == "onnx" else "p.pt2")
+    path = tmp_path_factory.mktemp("export") / f"p{SUFFIXES[form]}"
     return path, export_policy(policy, path, form)
 
 

@@ -23,15 +23,17 @@ class ExportOptions(RunOptions):
     """Write a trained policy to one file that runs without merl."""
 
     to: Form = "onnx"
-    """onnx, for ONNX Runtime and others, or torch, a program of torch.export."""
+    """onnx, for ONNX Runtime and others; torch, a program of torch.export; or numpy, a Python file
+    that needs NumPy alone."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The file; by default policy.onnx or policy.pt2. A card in JSON is written beside it."""
+    """The file; by default policy.onnx, policy.pt2 or policy.py. A card (JSON) is written
+    beside it."""
     checkpoint: str = "latest"
     """latest, best (the highest evaluation return), or the step of a checkpoint."""
 
 
 def export(args: list[str]) -> int:
-    """Export a policy: merl export RUN [--to onnx|torch] [--out FILE]."""
+    """Export a policy: merl export RUN [--to onnx|torch|numpy] [--out FILE]."""
     options = parse(ExportOptions, "merl export", args)
     out = (options.out or Path(f"policy{SUFFIXES[options.to]}")).absolute()
     if out.suffix != SUFFIXES[options.to]:

@@ -168,6 +168,11 @@ def key_pressed() -> Iterator[Callable[[], bool]]:
 
 
 def _policy(options: RunPolicyOptions) -> Policy | ExportedPolicy:
+    if options.run.suffix == SUFFIXES["numpy"]:
+        raise MerlError(
+            f"{options.run} is Python code: import its Policy into a program of your own, or "
+            "export the policy to onnx"
+        )
     if options.run.suffix in SUFFIXES.values():
         return ExportedPolicy(options.run)
     if options.trust:

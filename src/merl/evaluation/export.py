@@ -1,4 +1,4 @@
-"""Export a policy to one file that needs no merl: ONNX, or a program of torch.export.
+"""Export a policy to one file without merl: ONNX, a program of torch.export, or Python with NumPy.
 
 The exported function remembers nothing. Its inputs are one observation (each key that the policy
 uses) and, for each camera, the former frames; its outputs are the action in the environment's own
@@ -27,6 +27,7 @@ from merl.agents.ddpg import DDPG
 from merl.core import MerlError, check_choice
 from merl.evaluation.exported import FORMER, NEXT, Form, Run, Values, card_of, load_exported
 from merl.evaluation.policy import Policy
+from merl.evaluation.to_numpy import numpy_program
 from merl.runs import record
 
 CALLS = 200
@@ -87,7 +88,7 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
     Args:
         policy: the policy.
         output: the file; the card has the same name with `.json` appended.
-        form: `onnx` or `torch`.
+        form: `onnx`, `torch` or `numpy`.
 
     Returns:
         The card: inputs and outputs with shapes, types and bounds, the source, the latency.
@@ -110,9 +111,14 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
         with torch.no_grad(), _quiet():
             if form == "onnx":
                 _write_onnx(module, arguments, names, outputs, part)
-            else:
+            elif form == "torch":
                 with part.open("wb") as file:
                     torch.export.save(torch.export.export(module, arguments), file)
+            else:
+                program = torch.export.export(module, arguments)
+                title = f"A policy for {policy.config.task}, written by merl {merl.__version__}."
+                text = numpy_program(program, names, outputs, title, output.stem)
+                part.write_text(text)
         part.replace(output)
         run = load_exported(output, names, outputs)
         card = {

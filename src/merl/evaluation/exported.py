@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 from merl.core import MerlError, NotFinite, Observation
 from merl.core.user_code import in_one_line
 
-Form = Literal["onnx", "torch"]
-SUFFIXES: dict[Form, str] = {"onnx": ".onnx", "torch": ".pt2"}
+Form = Literal["onnx", "torch", "numpy"]
+SUFFIXES: dict[Form, str] = {"onnx": ".onnx", "torch": ".pt2", "numpy": ".py"}
 FORMER = "_former"
 """Ending of the inputs with the former frames of a camera."""
 NEXT = "_next"
@@ -130,6 +131,10 @@ def load_exported(path: Path, names: list[str], outputs: list[str]) -> Run:
         return lambda values: dict(
             zip(outputs, session.run(outputs, {name: values[name] for name in names}), strict=True)
         )
+    if path.suffix == SUFFIXES["numpy"]:
+        found: dict[str, Any] = runpy.run_path(str(path))
+        weights = found["Policy"]().weights
+        return lambda values: dict(found["compute"](weights, values))
     import torch
 
     module = torch.export.load(path).module()

@@ -1,0 +1,121 @@
+"""The Python file that needs NumPy alone computes what the policy computes, for every network."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from merl.agents import AGENTS, make_agent
+from merl.config import TrainConfig
+from merl.core import MerlError
+from merl.evaluation.export import export_policy, inputs_of
+from merl.evaluation.exported import ExportedPolicy
+from merl.evaluation.policy import Policy
+
+SPACE = spaces.Dict(
+    {
+        "depth": spaces.Box(0.0, 2.0, (24, 24, 1), np.float32),
+        "force": spaces.Box(-9.0, 9.0, (8, 3), np.float32),
+        "image": spaces.Box(0, 255, (24, 32, 3), np.uint8),
+        "joint": spaces.Box(-np.inf, np.inf, (6,), np.float32),
+    }
+)
+SMALL = {"hidden_dim": 32, "conv_channels": 8, "latent_dim": 64, "precision": "fp32"}
+
+
+def make_policy(name: str, space: spaces.Dict, **values: Any) -> Policy:
+    config = replace(AGENTS[name].config, **SMALL | values)
+    run = TrainConfig("somewhere:make", agent_name=name, agent=config)
+    agent = make_agent(
+        name,
+        config,
+        space,
+        spaces.Box(-1.0, 1.0, (4,), np.float32),
+        frame_stack=run.replay.frame_stack,
+        seed=1,
+        device=torch.device("cpu"),
+    )
+    return Policy(agent, run, space, torch.device("cpu"))
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("merl", {}),
+        ("merl", {"fusion_layer": "attention"}),
+        ("merl", {"fusion_layer": "simnorm", "fusion_norm": False}),
+        ("merl", {"encoders": {"image": "impala", "force": "transformer", "joint": "mlp"}}),
+        ("merl", {"standardize": True, "actor_average": 0.1, "latent_dim": 0}),
+        ("drqv2", {}),
+        ("sac", {"keys": ("joint",), "latent_dim": 0}),
+    ],
+)
+def test_actions_equal_those_of_the_policy(
+    name: str, values: dict[str, Any], tmp_path: Path
+) -> None:
+    policy = make_policy(name, SPACE, **values)
+    if values.get("standardize"):
+        generator = torch.Generator().manual_seed(3)
+        batch = {key: m.random(64, 3, generator) for key, m in policy.modalities.items()}
+        policy.agent.networks.encoders.observe(batch)  # type: ignore[attr-defined]
+    export_policy(policy, tmp_path / "p.py", "numpy")
+    exported = ExportedPolicy(tmp_path / "p.py")
+    for step in range(5):
+        given = inputs_of(policy, seed=step)
+        observation = {key: given[key] for key in policy.modalities}
+        former = {key: value for key, value in given.items() if key.endswith("_former")}
+        stacks = {
+            key: np.concatenate([given[f"{key}_former"], value[None]])
+            if f"{key}_former" in former
+            else value
+            for key, value in observation.items()
+        }
+        batch = {key: torch.from_numpy(value)[None] for key, value in stacks.items()}
+        exported._frames = dict(former)
+        np.testing.assert_allclose(
+            exported(observation),
+            policy.agent.act(batch, explore=False, step=0)[0].numpy(),
+            rtol=0,
+            atol=1e-5,
+        )
+
+
+def test_the_file_needs_neither_merl_nor_torch(tmp_path: Path) -> None:
+    policy = make_policy("merl", spaces.Dict(image=SPACE["image"], joint=SPACE["joint"]))
+    export_policy(policy, tmp_path / "arm.py", "numpy")
+    script = """
+import sys
+sys.modules["torch"] = sys.modules["merl"] = None  # importing either fails
+import numpy as np
+from arm import Policy
+policy = Policy()
+image, joint = np.full((24, 32, 3), 7, np.uint8), np.ones(6, np.float32)
+for _ in range(2):
+    action = policy({"image": image, "joint": joint})
+print(*action)
+"""
+    shown = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True
+    ).stdout
+    observation = {"image": np.full((24, 32, 3), 7, np.uint8), "joint": np.ones(6, np.float32)}
+    np.testing.assert_allclose([float(x) for x in shown.split()], policy(observation), atol=1e-5)
+
+
+def test_an_operation_without_a_form_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(
+        __import__("merl.evaluation.to_numpy", fromlist=["FORMS"]).FORMS, "tanh.default"
+    )
+    policy = make_policy("merl", spaces.Dict(joint=SPACE["joint"]))
+    with pytest.raises(MerlError, match="which --to numpy does not know"):
+        export_policy(policy, tmp_path / "p.py", "numpy")
+    assert not any(tmp_path.iterdir())

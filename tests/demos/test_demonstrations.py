@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 
 from merl.core import MerlError
@@ -15,6 +16,7 @@ from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode
 from merl.demos.recorder import Recorder
 from merl.replay import ReplayConfig
+from merl.replay.mixing import INTENDED
 
 OBSERVATION = spaces.Dict(
     {
@@ -64,15 +66,14 @@ def test_episodes_are_read_as_they_were_written(demos: Demonstrations) -> None:
     )
 
 
-@pytest.mark.parametrize("intended", [False, True])
-def test_a_replay_holds_every_step(demos: Demonstrations, intended: bool) -> None:
-    replay = demos.load(CONFIG, OBSERVATION, ACTION, intended=intended)
+def test_a_replay_holds_every_step(demos: Demonstrations) -> None:
+    replay = demos.load(CONFIG, OBSERVATION, ACTION)
     assert len(replay) == demos.steps
     batch = replay.sample(400, np.random.default_rng(0))
-    actions = {tuple(action) for action in batch.action.numpy().tolist()}
-    episodes = [*demos.episodes()]
-    expected = [one.intended if intended else one.actions for one in episodes]
-    assert actions == {tuple(action) for each in expected for action in each.tolist()}
+    both = torch.cat([batch.action, batch.observation[INTENDED]], dim=1)
+    expected = [np.hstack([one.actions, one.intended]) for one in demos.episodes()]
+    pairs = {tuple(row) for each in expected for row in each.tolist()}
+    assert {tuple(row) for row in both.tolist()} == pairs
     discounts = {round(float(d), 4) for d in batch.discount}
     # 0.9^3, shorter before a time limit, and 0 where the last episode terminated
     assert discounts == {0.729, 0.81, 0.9, 0.0}
@@ -90,7 +91,7 @@ def test_values_are_stored_in_the_type_of_their_space(tmp_path: Path) -> None:
 def test_keys_that_the_agent_does_not_use_are_left_out(demos: Demonstrations) -> None:
     joint = spaces.Dict({"joint": OBSERVATION["joint"]})
     batch = demos.load(CONFIG, joint, ACTION).sample(2, np.random.default_rng(0))
-    assert list(batch.observation) == ["joint"]
+    assert sorted(batch.observation) == ["intended action", "joint"]
 
 
 def test_the_digest_changes_with_any_byte(demos: Demonstrations) -> None:

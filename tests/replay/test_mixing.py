@@ -10,7 +10,7 @@ from gymnasium import spaces
 from merl.core import Transition
 from merl.networks.augmentation import RandomShift, shift
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
-from merl.replay.mixing import MixedReplay
+from merl.replay.mixing import INTENDED, MixedReplay
 
 OBSERVATION = spaces.Dict(
     {
@@ -21,16 +21,20 @@ OBSERVATION = spaces.Dict(
 ACTION = spaces.Box(-1.0, 1.0, (1,), np.float32)
 
 
-def replay_of(value: float, steps: int = 30) -> ReplayBuffer:
+def replay_of(value: float, steps: int = 30, intended: float | None = None) -> ReplayBuffer:
     """Return a replay whose actions are all `value`, with random images."""
+    space = dict(OBSERVATION.spaces)
+    if intended is not None:
+        space[INTENDED] = ACTION
     spec = ReplaySpec.of(
-        ReplayConfig(batch_size=4, frame_stack=2), OBSERVATION, ACTION, capacity=99
+        ReplayConfig(batch_size=4, frame_stack=2), spaces.Dict(space), ACTION, capacity=99
     )
     replay, rng = ReplayBuffer(spec), np.random.default_rng(int(100 * value))
 
     def observe() -> dict[str, np.ndarray]:
         image = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
-        return {"image": image, "joint": np.full(2, value, np.float32)}
+        found = {"image": image, "joint": np.full(2, value, np.float32)}
+        return found if intended is None else found | {INTENDED: np.full(1, intended, np.float32)}
 
     replay.begin(observe())
     for step in range(steps):
@@ -41,19 +45,22 @@ def replay_of(value: float, steps: int = 30) -> ReplayBuffer:
 
 @pytest.mark.parametrize(("ratio", "count"), [(0.5, 8), (0.25, 4), (1.0, 16), (0.001, 1)])
 def test_the_first_samples_are_demonstrations(ratio: float, count: int) -> None:
-    mixed = MixedReplay(replay_of(0.1), replay_of(0.7), ratio)
+    mixed = MixedReplay(replay_of(0.1), replay_of(0.7, intended=0.6), ratio)
     batch = mixed.sample(16, np.random.default_rng(0))
-    assert batch.demos == count
+    assert list(batch.observation) == list(batch.next_observation) == ["image", "joint"]
+    assert batch.shown is not None
+    torch.testing.assert_close(batch.shown, torch.full((count, 1), 0.6))
     expected = torch.full((16, 1), 0.1)
     expected[:count] = 0.7
     torch.testing.assert_close(batch.action, expected)
     torch.testing.assert_close(batch.observation["joint"], expected.expand(16, 2))
-    assert batch.to(torch.device("cpu")).demos == count
-    assert batch.to(torch.device("meta")).demos == count
+    moved = batch.to(torch.device("meta")).shown
+    assert moved is not None
+    assert moved.is_meta
 
 
 def test_random_shifts_belong_to_their_samples() -> None:
-    own, demos = replay_of(0.1), replay_of(0.7)
+    own, demos = replay_of(0.1), replay_of(0.7, intended=0.7)
     shifts = torch.randint(0, 5, (10, 2), generator=torch.Generator().manual_seed(0))
     plain = MixedReplay(own, demos, 0.3).sample(10, np.random.default_rng(3))
     transform = {"image": RandomShift(shifts, 2)}
@@ -68,6 +75,6 @@ def test_random_shifts_belong_to_their_samples() -> None:
 
 
 def test_equal_generators_give_equal_batches() -> None:
-    mixed = MixedReplay(replay_of(0.1), replay_of(0.7), 0.5)
+    mixed = MixedReplay(replay_of(0.1), replay_of(0.7, intended=0.7), 0.5)
     first, second = (mixed.sample(8, np.random.default_rng(5)) for _ in range(2))
     torch.testing.assert_close(first.observation, second.observation)

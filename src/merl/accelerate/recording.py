@@ -158,4 +158,5 @@ def _overwrite(target: Batch, batch: Batch) -> None:
 def _tensors(batch: Batch) -> list[Tensor]:
     observations = (batch.observation, batch.next_observation)
     observed = [value for observation in observations for value in observation.values()]
-    return [*observed, batch.action, batch.reward, batch.discount]
+    shown = [] if batch.shown is None else [batch.shown]
+    return [*observed, batch.action, batch.reward, batch.discount, *shown]

@@ -16,7 +16,6 @@ from merl.agents.config import ObservationConfig
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
 from merl.agents.merl import MERLConfig
-from merl.agents.networks import load_encoder_weights
 from merl.agents.sac import SAC, SACConfig
 from merl.core import Agent, MerlError, check_choice, suggest
 from merl.core.user_code import in_one_line, load_module
@@ -130,15 +129,6 @@ def make_agent(
         keys = tuple(observation_space)
         raise MerlError(f"agent {name!r}: senses is {senses!r}: return a tuple of keys of {keys}")
     return agent
-
-
-def load_initial_weights(agent: Agent, home: Path) -> None:
-    """Load the weights of encoders that the config names, into an agent that starts to train.
-
-    Arguments and exceptions are those of `load_encoder_weights`.
-    """
-    if isinstance(agent, DDPG):
-        load_encoder_weights(agent.networks, agent.config, home)
 
 
 def _default_config(name: str, found: type[Any]) -> ObservationConfig:

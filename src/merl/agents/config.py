@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from merl.core import Kind, MerlError
@@ -67,6 +68,9 @@ class AgentConfig(ObservationConfig):
     the run starts."""
     frozen_encoders: tuple[str, ...] = ()
     """Keys whose encoders are not trained."""
+    start_from: Path | None = None
+    """Run whose policy the agent starts with, e.g. one of agent `bc`: encoders, the actor's fusion
+    and the actor, which must have the same sizes. It is read once, when the run starts."""
     learning_rate: Positive = 1e-4
     """Step size of Adam, for every network."""
     learning_rate_end: Positive | None = None

@@ -321,6 +321,9 @@ class DDPG:
 
 
 def cloning_loss(mean: Tensor, batch: Batch) -> Tensor:
-    """Return the squared error of actions (B, A) on the batch's demonstrations, a scalar."""
-    shown = mean[: batch.demos].float()
-    return (shown - batch.action[: batch.demos]).square().mean()
+    """Return the squared error of actions (B, A) on the batch's demonstrations, a scalar.
+
+    Synthetic batches, with which updates are timed, have none: then all their actions count.
+    """
+    shown = batch.action if batch.shown is None else batch.shown
+    return (mean[: len(shown)].float() - shown).square().mean()

@@ -103,6 +103,23 @@ class Networks(nn.Module):
         recent: list[Tensor] = [*self.fusion_of_actor().parameters(), *self.actor.parameters()]
         torch._foreach_lerp_(average, recent, tau)
 
+    def take_policy(self, other: Networks) -> None:
+        """Copy the policy of other networks: encoders, the actor's fusion and the actor.
+
+        If they have a moving average, that is the policy, as in deployment.
+
+        Raises:
+            RuntimeError: the parts have other keys or sizes.
+        """
+        average = other.policy_average
+        fusion = other.fusion_of_actor() if average is None else average["fusion"]
+        actor = other.actor if average is None else average["actor"]
+        self.encoders.load_state_dict(other.encoders.state_dict())
+        self.fusion_of_actor().load_state_dict(fusion.state_dict())
+        self.actor.load_state_dict(actor.state_dict())
+        if self.policy_average is not None:
+            self.start_average()
+
     def fusion_of_actor(self) -> Fusion | Concatenation:
         """Return the fusion that the actor uses: its own, or the critic's."""
         return self.critic_fusion if self.actor_fusion is None else self.actor_fusion

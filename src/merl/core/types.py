@@ -95,7 +95,8 @@ class Batch:
             earlier.
         discount: gamma^m, or 0 if the episode terminated; float32 (B,).
         next_observation: o_{t+m}, with the same keys, shapes and types as `observation`.
-        demos: number of samples that come from demonstrations; these are the first ones.
+        shown: for the first N samples, which come from demonstrations, the actions as intended,
+            without the noise that was added to them, float32 (N, A); None without demonstrations.
     """
 
     observation: dict[str, Tensor]
@@ -103,7 +104,7 @@ class Batch:
     reward: Tensor
     discount: Tensor
     next_observation: dict[str, Tensor]
-    demos: int = 0
+    shown: Tensor | None = None
 
     def to(self, device: torch.device) -> Batch:
         """Return the batch on `device`; return `self` if it is already there."""
@@ -115,7 +116,7 @@ class Batch:
             self.reward.to(device),
             self.discount.to(device),
             {key: value.to(device) for key, value in self.next_observation.items()},
-            self.demos,
+            None if self.shown is None else self.shown.to(device),
         )
 
 

@@ -24,6 +24,7 @@ from gymnasium import spaces
 from merl.core import MerlError, Transition, counted
 from merl.demos.episode import Episode
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
+from merl.replay.mixing import INTENDED
 from merl.runs.plain import box, describe, told
 
 INDEX = "demos.json"
@@ -190,16 +191,15 @@ class Demonstrations:
         config: ReplayConfig,
         observation_space: spaces.Dict,
         action_space: spaces.Box,
-        *,
-        intended: bool = False,
     ) -> ReplayBuffer:
         """Return a replay buffer in memory that holds all episodes, with the given keys.
+
+        The intended action of each step is stored as observation `merl.replay.mixing.INTENDED`.
 
         Args:
             config: how it is sampled.
             observation_space: the keys that the agent uses.
             action_space: the agent's actions.
-            intended: store the intended actions in place of the executed ones, for imitation.
 
         Raises:
             MerlError: they do not fit the spaces, are empty, or cannot be read.
@@ -209,17 +209,19 @@ class Demonstrations:
             raise MerlError(f"{self.path} holds no episode")
         # A slot more for the start of each episode, which may be short.
         capacity = self.steps + len(self.lines)
-        spec = ReplaySpec.of(config, observation_space, action_space, capacity=capacity)
+        space = spaces.Dict({**observation_space.spaces, INTENDED: action_space})
+        spec = ReplaySpec.of(config, space, action_space, capacity=capacity)
         replay = ReplayBuffer(spec)
         for episode in self.episodes():
             stored = {key: episode.observations[key] for key in observation_space}
-            actions = episode.intended if intended else episode.actions
+            after = np.zeros_like(episode.intended[:1])  # there is no action after the last step
+            stored[INTENDED] = np.concatenate([episode.intended, after])
             replay.begin({key: values[0] for key, values in stored.items()})
             for step in range(len(episode)):
                 last = step == len(episode) - 1
                 replay.add(
                     Transition(
-                        actions[step],
+                        episode.actions[step],
                         float(episode.rewards[step]),
                         0.0 if last and episode.terminated else 1.0,
                         {key: values[step + 1] for key, values in stored.items()},

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from merl.core import Batch, FrameTransform, FrameTransforms
 from merl.replay.buffer import ReplayBuffer
 
+INTENDED = "intended action"
+"""Observation key under which a replay of demonstrations holds the intended action."""
+
 
 class MixedReplay:
     """A source of batches: first samples of demonstrations, then samples of the run's own replay.
 
     Args:
         own: the replay of the run.
-        demos: the demonstrations.
+        demos: the demonstrations, with the intended actions as observation `INTENDED`.
         ratio: share of the demonstrations in a batch, in (0, 1].
     """
 
@@ -34,9 +37,9 @@ class MixedReplay:
     ) -> Batch:
         """Draw a batch; see `ReplayBuffer.sample`."""
         count = max(1, round(self.ratio * batch_size))
-        shown = self.demos.sample(count, rng, now, then)
+        shown = _with_intended(self.demos.sample(count, rng, now, then))
         if count == batch_size:
-            return replace(shown, demos=count)
+            return shown
         own = self.own.sample(
             batch_size - count, rng, _moved(now or {}, count), _moved(then or {}, count)
         )
@@ -52,8 +55,14 @@ class MixedReplay:
                 key: torch.cat([shown.next_observation[key], own.next_observation[key]])
                 for key in own.next_observation
             },
-            demos=count,
+            shown.shown,
         )
+
+
+def _with_intended(batch: Batch) -> Batch:
+    """Move the intended actions from the observations to `shown`."""
+    batch.next_observation.pop(INTENDED)
+    return replace(batch, shown=batch.observation.pop(INTENDED))
 
 
 def _moved(transforms: FrameTransforms, count: int) -> FrameTransforms:

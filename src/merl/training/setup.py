@@ -243,8 +243,7 @@ def load_demos(
             "them, or name their folder with --replay.demos"
         )
     replay = dataclasses.replace(replay, demos=found.path, demos_hash=digest)
-    imitates = agent is not None and agent.imitates
-    loaded = found.load(config.replay, space, action_space, intended=imitates)
+    loaded = found.load(config.replay, space, action_space)
     return loaded, dataclasses.replace(config, replay=replay)
 
 

@@ -10,7 +10,6 @@ from threading import Lock
 
 from merl.acting.rollout import FrameStack, mean_metrics, report_success
 from merl.acting.run_env import own_bounds
-from merl.agents import load_initial_weights
 from merl.callbacks import Callback, CallbackList
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import EnvironmentsLost, EvaluationFailed, MerlError, counted
@@ -24,6 +23,7 @@ from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
 from merl.training.evaluator import Evaluations
+from merl.training.initial import load_initial_weights
 from merl.training.loop import Collector, Progress, StepResult, train
 from merl.training.meters import Averages, Clock, EpisodeWatch
 from merl.training.outcome import Outcome

@@ -30,6 +30,7 @@ from merl.envs.user_env import load_module, make_user_env
 from merl.evaluation.exported import SUFFIXES, ExportedPolicy
 from merl.evaluation.policy import Policy, load_policy
 from merl.evaluation.realtime import Driven, Limits, check_rate, drive
+from merl.runs.plain import describe, told
 from merl.runs.run import Run
 
 STOP_KEYS = " q\x1b\r\n"
@@ -121,26 +122,25 @@ def check_fits(policy: Policy | ExportedPolicy, env: gymnasium.Env[Any, Any]) ->
     Raises:
         MerlError: a key is missing or differs, or the actions have another length.
     """
-    if isinstance(policy, ExportedPolicy):
-        wanted = policy.inputs
-        size = int(policy.card["outputs"]["action"]["shape"][0])
-    else:
-        wanted = {key: (np.dtype(m.space.dtype), m.shape) for key, m in policy.modalities.items()}
-        assert policy.run is not None
-        (size,) = policy.run.spaces()[1].shape
     assert isinstance(env.observation_space, spaces.Dict)
-    for key, (kind, shape) in wanted.items():
+    for key, modality in policy.modalities.items():
         space = env.observation_space.spaces.get(key)
         if space is None:
             raise MerlError(
                 f"the environment has no observation {key!r}, which the policy uses: it has "
                 f"{', '.join(env.observation_space.spaces)}"
             )
-        if space.shape != shape or space.dtype != kind:
+        own, trained = told(describe(space)), told(describe(modality.space))
+        if own != trained:
             raise MerlError(
-                f"observation {key!r} of the environment is {space.dtype} {space.shape}, and the "
-                f"policy was trained with {kind} {shape}"
+                f"observation {key!r} of the environment is {own}, and the policy was trained with "
+                f"{trained}"
             )
+    if isinstance(policy, ExportedPolicy):
+        size = policy.action_size
+    else:
+        assert policy.run is not None
+        (size,) = policy.run.spaces()[1].shape
     if env.action_space.shape != (size,):
         raise MerlError(
             f"the environment's actions are {env.action_space.shape}, and the policy's ({size},)"

@@ -29,6 +29,7 @@ from merl.evaluation.exported import FORMER, NEXT, Form, Run, Values, card_of, l
 from merl.evaluation.policy import Policy
 from merl.evaluation.to_numpy import numpy_program
 from merl.runs import record
+from merl.runs.plain import describe
 
 CALLS = 200
 """Calls of the latency's measurement."""
@@ -130,6 +131,7 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
             "commit": recorded.get("commit"),
             "inputs": {name: _told(example[name]) for name in names},
             "outputs": {name: _told(value) for name, value in run(example).items()},
+            "observations": {key: describe(m.space) for key, m in policy.modalities.items()},
             "action_bounds": [module.low.tolist(), module.high.tolist()],
             "former_frames": "at the start of an episode, copies of the first frame",
             "milliseconds": _latency(run, example),

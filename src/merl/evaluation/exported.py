@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
-from merl.core import MerlError, NotFinite, Observation
+from merl.core import MerlError, Observation
 from merl.core.user_code import in_one_line
+from merl.evaluation.policy import checked
+from merl.modalities import modalities_of
+from merl.runs.plain import box
 
 Form = Literal["onnx", "torch", "numpy"]
 SUFFIXES: dict[Form, str] = {"onnx": ".onnx", "torch": ".pt2", "numpy": ".py"}
@@ -35,7 +39,8 @@ class ExportedPolicy:
 
     Attributes:
         card: what the card says.
-        inputs: type and shape of each observation.
+        modalities: the modality of each key that the policy uses.
+        action_size: length of an action.
 
     Raises:
         MerlError: the file or its card is missing or damaged, or one is of another policy.
@@ -50,9 +55,12 @@ class ExportedPolicy:
                 name: (np.dtype(each["dtype"]), tuple(each["shape"]))
                 for name, each in self.card["inputs"].items()
             }
-        except (KeyError, TypeError, ValueError) as error:
+            observed = self.card["observations"].items()
+            space = spaces.Dict({key: box(described) for key, described in observed})
+            (self.action_size,) = self.card["outputs"]["action"]["shape"]
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise MerlError(f"{card_of(path)} is damaged: {error!r}") from None
-        self.inputs = {name: each for name, each in told.items() if not name.endswith(FORMER)}
+        self.modalities = modalities_of(space)
         self._former = {name: each for name, each in told.items() if name.endswith(FORMER)}
         self._low, self._high = low, high
         try:
@@ -72,21 +80,12 @@ class ExportedPolicy:
         """Return the action for an observation, in [-1, 1], as `Policy` does.
 
         Raises:
-            MerlError: a key is missing, or has another shape or type.
-            NotFinite: the observation contains NaN or infinity.
+            MerlError, NotFinite: see `Policy`.
         """
-        values = {}
-        for name, (kind, shape) in self.inputs.items():
-            if name not in observation:
-                raise MerlError(f"the observation lacks {name!r}: it needs {list(self.inputs)}")
-            value = np.asarray(observation[name])
-            if value.dtype != kind or value.shape != shape:
-                raise MerlError(
-                    f"observation {name!r} is {value.dtype} {value.shape}, not {kind} {shape}"
-                )
-            if not np.isfinite(value).all():
-                raise NotFinite(f"observation {name!r} contains NaN or infinity")
-            values[name] = value
+        values = {
+            key: modality.to_stored(checked(key, modality, observation))
+            for key, modality in self.modalities.items()
+        }
         for name, (_, shape) in self._former.items():
             frame = values[name.removesuffix(FORMER)]
             values[name] = self._frames.get(name, np.broadcast_to(frame, shape).copy())

@@ -24,7 +24,7 @@ from merl.envs.user_env import MakeEnv
 from merl.envs.user_spaces import UserKey
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.video import MIN_SIDE
-from merl.modalities import modalities_of
+from merl.modalities import Modality, modalities_of
 from merl.runs.checkpoint import Checkpoint, load_policy_of, readable
 from merl.runs.run import Run
 
@@ -60,7 +60,6 @@ class Policy:
         self.agent = agent
         known = modalities_of(space)
         self.modalities = {key: known[key] for key in agent.senses}
-        self._keys = {key: UserKey.as_trained(key, m) for key, m in self.modalities.items()}
         self._stack = FrameStack(self.modalities, config.replay.frame_stack, device)
         self._fresh = True
 
@@ -83,7 +82,7 @@ class Policy:
                 converted to an array.
             NotFinite: the observation contains NaN or infinity.
         """
-        sensed = {key: self._checked(key, observation) for key in self._keys}
+        sensed = {key: checked(key, m, observation) for key, m in self.modalities.items()}
         if self._fresh:
             self._stack.reset(sensed)
         else:
@@ -187,18 +186,23 @@ class Policy:
         finally:
             made.close()
 
-    def _checked(self, key: str, observation: Observation) -> NDArray[Any]:
-        if not isinstance(observation, Mapping):
-            raise MerlError(
-                f"the observation is a {type(observation).__name__}: give a dict with the keys "
-                f"{list(self._keys)}"
-            )
-        if key not in observation:
-            raise MerlError(f"the observation lacks {key!r}: the agent needs {list(self._keys)}")
-        value = self._keys[key].convert(observation[key])
-        if not np.isfinite(value).all():
-            raise NotFinite(f"observation {key!r} contains NaN or infinity: {value}")
-        return value
+
+def checked(key: str, modality: Modality, observation: Observation) -> NDArray[Any]:
+    """Return the value of a key in the form of training.
+
+    Raises:
+        MerlError, NotFinite: see `Policy.__call__`.
+    """
+    if not isinstance(observation, Mapping):
+        raise MerlError(
+            f"the observation is a {type(observation).__name__}: give a dict with the key {key!r}"
+        )
+    if key not in observation:
+        raise MerlError(f"the observation lacks {key!r}: it has {list(observation)}")
+    value = UserKey.as_trained(key, modality).convert(observation[key])
+    if not np.isfinite(value).all():
+        raise NotFinite(f"observation {key!r} contains NaN or infinity: {value}")
+    return value
 
 
 def load_policy(

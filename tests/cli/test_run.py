@@ -88,7 +88,10 @@ def test_an_exported_policy_runs_or_is_named(
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("small", "is uint8 (16, 16, 3) from 0 to 255, and the policy was trained with uint8 (24, 24,"),
+        (
+            "small",
+            "is uint8 (16, 16, 3) from 0 to 255, and the policy was trained with uint8 (24, 24,",
+        ),
         ("blind", "no observation 'image', which the policy uses: it has proprio"),
     ],
 )

@@ -82,7 +82,9 @@ def test_it_solves_the_same_episodes(exported: tuple[Path, dict[str, Any]], poli
 
 def test_the_card_tells_what_a_robot_needs(exported: tuple[Path, dict[str, Any]]) -> None:
     path, card = exported
-    assert json.loads(path.with_name(path.name + ".json").read_text()) == json.loads(json.dumps(card))
+    assert json.loads(path.with_name(path.name + ".json").read_text()) == json.loads(
+        json.dumps(card)
+    )
     assert card["inputs"]["image"] == {"dtype": "uint8", "shape": [24, 24, 3]}
     assert card["inputs"]["image_former"]["shape"] == [1, 24, 24, 3]
     assert card["outputs"]["action"] == {"dtype": "float32", "shape": [9]}

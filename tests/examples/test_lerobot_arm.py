@@ -1,0 +1,106 @@
+"""The arm's environment keeps its limits, and merl learns in it; the arm is simulated."""
+
+from __future__ import annotations
+
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from merl.cli import main
+from merl.demos.demonstrations import Demonstrations
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+class SimulatedArm:
+    """A robot with LeRobot's interface: each joint moves a third of the way to its target."""
+
+    def __init__(self, at: dict[str, float]) -> None:
+        self.at, self.sent, self.connected = dict(at), list[dict[str, float]](), True
+
+    def get_observation(self) -> dict[str, Any]:
+        assert self.connected
+        pan = int(self.at["shoulder_pan"]) + 100
+        return {f"{name}.pos": value for name, value in self.at.items()} | {
+            "front": np.full((48, 64, 3), pan, np.uint8),
+            "wrist": np.zeros((48, 64, 3), np.uint8),
+        }
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        assert self.connected
+        self.sent.append(action)
+        for name in self.at:
+            self.at[name] += (action[f"{name}.pos"] - self.at[name]) / 3
+        return action
+
+    def disconnect(self) -> None:
+        self.connected = False
+
+
+@pytest.fixture
+def module(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """Import the example; its pauses take no time."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import lerobot_arm
+
+    monkeypatch.setattr(lerobot_arm.time, "sleep", lambda seconds: None)
+    return lerobot_arm
+
+
+def arm(module: types.ModuleType, **options: Any) -> tuple[Any, SimulatedArm]:
+    start = {name: 7.0 for name in module.REST}
+    robot = SimulatedArm(start)
+    return module.LeRobotArm(robot, lambda: None, lambda: False, **options), robot
+
+
+def test_it_is_a_gymnasium_environment(module: types.ModuleType) -> None:
+    env, _ = arm(module)
+    check_env(env, skip_render_check=True)
+
+
+def test_targets_keep_their_limits(module: types.ModuleType) -> None:
+    env, robot = arm(module)
+    env.reset()
+    rest = [module.REST[name] for name in module.REST]
+    assert list(robot.sent[-1].values()) == rest
+    steps = np.diff([list(sent.values()) for sent in robot.sent], axis=0)
+    assert np.abs(steps).max() <= module.STEP + 1e-9  # also on the way to rest
+    for sign in (1.0, -1.0):
+        for _ in range(80):
+            before = np.array([robot.at[name] for name in module.REST])
+            env.step(np.full(6, sign * 5.0))  # beyond the action space
+            target = np.array(list(robot.sent[-1].values()))
+            assert np.abs(target - before).max() <= module.LEAD + module.STEP + 1e-9
+        bound = module.HIGH if sign > 0 else module.LOW
+        assert list(robot.sent[-1].values()) == [bound[name] for name in module.REST]
+    env.close()
+    assert not robot.connected
+
+
+def test_the_whole_way_runs(
+    module: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Train, run with a log, clone the log, and train from the clone."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, "connect", lambda: SimulatedArm({n: 0.0 for n in module.REST}))
+    monkeypatch.setattr("builtins.input", lambda prompt: "")
+    monkeypatch.setattr(module, "_enter_pressed", lambda: False)
+    monkeypatch.setattr(module, "EPISODE", 20)
+    monkeypatch.setitem(sys.modules, "lerobot_arm", module)
+    small = ["--preset", "laptop", "--eval.every", "0", "--threads", "1", "--replay.batch-size"]
+    small += ["8", "--random-steps", "1", "--seed-steps", "10", "--agent.precision", "fp32"]
+    train = ["train", "lerobot_arm:make_env", *small, "--steps", "40"]
+    assert main([*train, "--run-dir", "first"]) == 0
+    command = ["run", "first", "--env", "lerobot_arm:make_unpaced", "--hz", "200"]
+    assert main([*command, "--log", "log", "--max-late", "1000"]) == 0
+    assert Demonstrations.open(tmp_path / "log").steps == 20
+    index = tmp_path / "log" / "demos.json"
+    index.write_text(index.read_text().replace("make_unpaced", "make_env"))
+    assert main([*train, "--agent", "bc", "--replay.demos", "log", "--run-dir", "cloned"]) == 0
+    start = ["--agent.start-from", "cloned", "--replay.demos", "log", "--run-dir", "second"]
+    assert main([*train, *start]) == 0

@@ -3,9 +3,9 @@
     merl train lerobot_arm:make_env --eval.every 0 --random-steps 1 --agent.start-from runs/cloned
     merl run runs/RUN --env lerobot_arm:make_unpaced --hz 15
 
-Fill in `connect` for your arm. docs/howto/real_robot.md explains the whole way. An action changes the
-joints' targets by at most `STEP`; targets never leave `LOW` to `HIGH`, and never lead the joints by more
-than `LEAD`.
+Fill in `connect` for your arm. docs/howto/real_robot.md explains the whole way. An action changes
+the joints' targets by at most `STEP`; targets never leave `LOW` to `HIGH`, and a step begins with
+targets at most `LEAD` from the joints.
 """
 
 from __future__ import annotations

@@ -58,6 +58,7 @@ def test_a_run_learns_from_demonstrations_and_resumes_exactly(
 ) -> None:
     train = ["train", "reach_duplo", "--agent", agent, *TINY, "--replay.demos", str(demos)]
     clone = [] if agent == "bc" else ["--agent.clone-weight", "0.5", "--agent.clone-steps", "400"]
+    clone += [] if agent == "bc" else ["--agent.clone-better"]
     runs = {name: tmp_path / name for name in ("whole", "halves", "without")}
     assert main([*train, *clone, "--steps", "500", "--run-dir", str(runs["whole"])]) == 0
     assert main([*train, *clone, "--steps", "250", "--run-dir", str(runs["halves"])]) == 0
@@ -144,6 +145,10 @@ def test_a_policy_can_demonstrate(tmp_path: Path) -> None:
         (
             ["train", "reach_duplo", *TINY, "--agent.clone-weight", "1"],
             "agent.clone-weight 1.0 clones demonstrations",
+        ),
+        (
+            ["train", "reach_duplo", *TINY, "--agent.clone-better"],
+            "agent.clone-better is an option of the cloning term",
         ),
         (
             ["train", "reach_duplo", *TINY, "--replay.demos", "nowhere"],

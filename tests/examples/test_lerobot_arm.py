@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from merl.cli import main
 from merl.demos.demonstrations import Demonstrations
@@ -53,14 +52,21 @@ def module(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
 
 
 def arm(module: types.ModuleType, **options: Any) -> tuple[Any, SimulatedArm]:
-    start = {name: 7.0 for name in module.REST}
+    start = dict.fromkeys(module.REST, 7.0)
     robot = SimulatedArm(start)
     return module.LeRobotArm(robot, lambda: None, lambda: False, **options), robot
 
 
-def test_it_is_a_gymnasium_environment(module: types.ModuleType) -> None:
-    env, _ = arm(module)
-    check_env(env, skip_render_check=True)
+def test_observations_fit_their_space(module: types.ModuleType) -> None:
+    env, robot = arm(module)
+    observation, _ = env.reset()
+    assert observation in env.observation_space
+    assert set(observation) == {"front", "wrist", "joints"}
+    robot.at["shoulder_pan"] = 50.0
+    observation, reward, terminated, truncated, info = env.step(np.zeros(6, np.float32))
+    assert observation in env.observation_space
+    assert observation["front"].mean() in range(105, 150)  # the image shows the arm where it is
+    assert (reward, terminated, truncated, info) == (0.0, False, False, {"success": False})
 
 
 def test_targets_keep_their_limits(module: types.ModuleType) -> None:
@@ -87,7 +93,7 @@ def test_the_whole_way_runs(
 ) -> None:
     """Train, run with a log, clone the log, and train from the clone."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "connect", lambda: SimulatedArm({n: 0.0 for n in module.REST}))
+    monkeypatch.setattr(module, "connect", lambda: SimulatedArm(dict.fromkeys(module.REST, 0.0)))
     monkeypatch.setattr("builtins.input", lambda prompt: "")
     monkeypatch.setattr(module, "_enter_pressed", lambda: False)
     monkeypatch.setattr(module, "EPISODE", 20)

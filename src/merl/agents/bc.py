@@ -10,8 +10,9 @@ from typing import Any
 
 from torch import Tensor
 
+from merl.agents.cloning import cloning_loss
 from merl.agents.config import AgentConfig
-from merl.agents.ddpg import DDPG, cloning_loss
+from merl.agents.ddpg import DDPG
 from merl.agents.optimizers import adam, set_step_size, step_optimizer
 from merl.core import Batch, UpdateNoise, UpdatePlan
 from merl.networks.settings import with_torch_settings

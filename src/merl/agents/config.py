@@ -109,6 +109,9 @@ class AgentConfig(ObservationConfig):
     clone_weight: NotNegative = 0.0
     """Weight of a term in the actor's loss that clones the demonstrations (`--replay.demos`): the
     squared error of its actions, in units of the mean absolute value of the critic."""
+    clone_better: bool = False
+    """Clone the run's own actions too, where the critic rates them above the actor's (Q-filter).
+    The squared error is then a mean over the whole batch, in which other own actions count as 0."""
     clone_steps: Annotated[int, Range(1, 10**12)] | None = None
     """Environment steps over which that weight falls to 0; if not set, it is constant."""
     target: Target = "heads"
@@ -152,6 +155,11 @@ class AgentConfig(ObservationConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_histogram()
+        if self.clone_better and not self.clone_weight:
+            raise MerlError(
+                "agent.clone-better is an option of the cloning term, and agent.clone-weight 0 "
+                "disables it: set a weight"
+            )
         if self.privileged and self.fusion != "decoupled":
             raise MerlError(
                 f"agent.privileged {self.privileged} needs separate fusions for critic and actor: "

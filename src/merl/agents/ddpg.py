@@ -20,6 +20,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
+from merl.agents.cloning import better_loss, cloning_loss
 from merl.agents.config import AgentConfig
 from merl.agents.gradients import clamp_straight_through, frozen
 from merl.agents.networks import make_networks
@@ -202,12 +203,24 @@ class DDPG:
             q = self.q(encoded, clamp_straight_through(mean + noise))
             loss = -q.mean()
         if self.config.clone_weight:
-            loss = loss + plan.clone_weight * q.detach().abs().mean() * cloning_loss(mean, batch)
+            error = self.cloning_error(encoded, mean, batch)
+            loss = loss + plan.clone_weight * q.detach().abs().mean() * error
         step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         return {
             "actor_loss": loss.detach(),
             "action_saturation": (mean.detach().abs() > 0.95).float().mean(),
         }
+
+    def cloning_error(self, encoded: Mapping[str, Tensor], mean: Tensor, batch: Batch) -> Tensor:
+        """Return the squared error of the actor's actions (B, A) that is to be cloned away."""
+        if not self.config.clone_better:
+            return cloning_loss(mean, batch)
+
+        def value(action: Tensor) -> Tensor:
+            with torch.no_grad(), self._arithmetic():
+                return self.q(encoded, action)
+
+        return better_loss(mean, batch, value)
 
     def q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
         """Return min_k Q_phi_k(o_t, a), (B,), differentiable in the action alone."""
@@ -318,12 +331,3 @@ class DDPG:
         """Return a context with autocast to bf16, enabled if the config chooses bf16."""
         enabled = self.config.precision == "bf16"
         return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled)
-
-
-def cloning_loss(mean: Tensor, batch: Batch) -> Tensor:
-    """Return the squared error of actions (B, A) on the batch's demonstrations, a scalar.
-
-    Synthetic batches, with which updates are timed, have none: then all their actions count.
-    """
-    shown = batch.action if batch.shown is None else batch.shown
-    return (mean[: len(shown)].float() - shown).square().mean()

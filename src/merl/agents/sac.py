@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from merl.agents.config import Positive
-from merl.agents.ddpg import DDPG, DDPGConfig, cloning_loss
+from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.optimizers import adam, load_optimizer, step_optimizer
 from merl.core import Batch, MerlError, UpdatePlan
 from merl.networks.heads import Actor, GaussianActor
@@ -91,8 +91,8 @@ class SAC(DDPG):
         alpha = self.log_alpha.exp().detach()
         loss = (alpha * log_prob - q).mean()
         if self.config.clone_weight:
-            cloned = cloning_loss(torch.tanh(mean), batch)
-            loss = loss + plan.clone_weight * q.detach().abs().mean() * cloned
+            error = self.cloning_error(encoded, torch.tanh(mean), batch)
+            loss = loss + plan.clone_weight * q.detach().abs().mean() * error
         step_optimizer(self.actor_optimizer, loss, self.actor_parameters)
         entropy = -log_prob.detach().mean()
         target = self.config.target_entropy

@@ -118,6 +118,18 @@ HEAD_LAYERS = {"move_box": 6, "lift_box": 6}
 """Layers of MERL's heads in preset `paper`, for tasks with other than three (MERL C.1)."""
 
 
+IMITATING = {
+    "replay.demos_ratio": 1.0,
+    "num_envs": 1,
+    "synchronous": True,
+    "updates_per_step": 1.0,
+    "random_steps": 0,
+    "seed_steps": 0,
+    "steps": 30_000,
+}
+"""Values of an agent that learns from demonstrations alone: its steps move nothing, and each is an
+update."""
+
 PUBLISHED: dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
     # DrQ-v2's repository, for its tasks of medium difficulty: each action is held for two steps, an
     # update every second action, 2000 random actions, noise that falls over 500,000 actions.
@@ -184,7 +196,7 @@ def compose(
         config, chosen.for_user_env if config.has_user_env else {"eval.references": True}
     )
     if name in AGENTS and AGENTS[name].imitates:
-        config = override(config, {"replay.demos_ratio": 1.0})
+        config = override(config, IMITATING)
     values = _agent_values(base, preset, config) if isinstance(base, AgentConfig) else {}
     if setting == "published":
         if name not in PUBLISHED:

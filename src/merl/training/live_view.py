@@ -102,9 +102,10 @@ class LiveView(Callback):
 
     def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
         """Show the metrics of an episode."""
-        self._recent.append(metrics)
-        self._training_return = metrics["train/return"]
-        self._training = self._recent_training()
+        if "train/return" in metrics:  # not of an agent that imitates
+            self._recent.append(metrics)
+            self._training_return = metrics["train/return"]
+            self._training = self._recent_training()
         self._speed = (
             f"{metrics['time/steps_per_second']:.0f} steps/s, "
             f"{metrics['time/updates_per_second']:.0f} updates/s"
@@ -118,7 +119,7 @@ class LiveView(Callback):
             left = self._time_left()
             self._print(
                 f"{self._position()} ({self._fraction():.0%}{f', {left}' if left else ''}): "
-                f"training {self._training}; {self._speed}"
+                f"{f'training {self._training}; ' if self._training else ''}{self._speed}"
             )
 
     def on_evaluation_step(self, episode: int, total: int) -> None:

@@ -18,6 +18,7 @@ from merl.accelerate.networks import speed_up
 from merl.acting.env_checks import check_instances
 from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
+from merl.acting.still import StillEnvs
 from merl.acting.workers import WorkerEnvs, check_sendable
 from merl.agents import AGENTS, make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
@@ -107,10 +108,21 @@ class Setup:
         speed_up(self.agent)
 
     def make_environments(self) -> Environments:
-        """Return the environments that the run trains in: `env`, or worker processes."""
+        """Return the environments that the run trains in: `env`, or worker processes.
+
+        An agent that imitates moves nothing while it trains.
+        """
+        if self.imitates:
+            return StillEnvs(self.space, self.action_space, self.config.num_envs)
         if self.config.has_workers:
             return WorkerEnvs(self.config, self.env, self.make)
         return InProcessEnvs(self.env)
+
+    @property
+    def imitates(self) -> bool:
+        """Whether the agent learns from demonstrations alone."""
+        kind = AGENTS.get(self.config.agent_name)
+        return kind is not None and kind.imitates
 
     def batches_from(self, replay: ReplayBuffer) -> ReplayBuffer | MixedReplay:
         """Return the source of batches: the run's replay, with its demonstrations if it has any."""

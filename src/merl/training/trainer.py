@@ -336,7 +336,7 @@ class Trainer:
         progress = self.progress
         progress.reports_success |= report_success(result.episodes)
         means = mean_metrics(result.episodes, reports_success=progress.reports_success)
-        values = {f"train/{k}": v for k, v in means.items()}
+        values = {} if self.setup.imitates else {f"train/{k}": v for k, v in means.items()}
         values |= self._averages.take()
         values |= self.clock.rates(progress)
         values |= {"replay/steps": float(len(self.replay))}

@@ -1,0 +1,59 @@
+"""Environments in which nothing moves, for an agent that learns from demonstrations alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from merl.acting.environments import Step
+from merl.core import Observation
+
+EPISODE = 250
+"""Steps of an episode: how often a run logs, and may evaluate and save."""
+
+
+class StillEnvs:
+    """Environments whose observations and rewards are all 0; see `Environments`.
+
+    Args:
+        space: the observation space.
+        action_space: the action space.
+        count: number of environments.
+    """
+
+    def __init__(self, space: spaces.Dict, action_space: spaces.Box, count: int) -> None:
+        self.count, self.action_shape = count, action_space.shape
+        self._zeros: Observation = {
+            key: np.zeros(box.shape or (), box.dtype) for key, box in space.spaces.items()
+        }
+        self._steps = 0
+
+    def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
+        """See `Environments`."""
+        self._steps = 0  # all episodes begin and end together
+        return dict.fromkeys(seeds, self._zeros)
+
+    def send(self, actions: NDArray[np.float32]) -> None:
+        """Do nothing."""
+
+    def receive(self) -> list[Step]:
+        """See `Environments`."""
+        self._steps += 1
+        return [Step(self._zeros, 0.0, False, self._steps == EPISODE, {})] * self.count
+
+    def states(self) -> list[dict[str, Any]]:
+        """See `Environments`."""
+        return [{}] * self.count
+
+    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        """Do nothing."""
+
+    def restart(self) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""

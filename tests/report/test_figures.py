@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from matplotlib.image import imread
 from merl.core import MerlError
 from merl.report import figures
 from merl.report.curves import Curve
+from merl.report.drawing import headline, new_figure, save
 from merl.report.figures import learning_curve, learning_curves, reward_terms
 
 HEADER = (
@@ -208,3 +210,15 @@ def test_reward_terms_refuses_a_run_without_terms(tmp_path):
     (tmp_path / "metrics.csv").write_text("step,eval/return\n1000,2.0\n")
     with pytest.raises(MerlError, match=r"mine: .* has no terms of a reward"):
         reward_terms({"mine": tmp_path}, tmp_path / "terms.png")
+
+
+def test_names_are_drawn_as_they_are(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    """A pair of dollars is no formula, and a letter that the font lacks is no warning."""
+    figure = new_figure(2.0)
+    axes = figure.add_subplot()
+    axes.plot([1, 1000], [0, 1])
+    headline(figure, "cost $a_b$ and $\\frac$ 机器人")
+    text = save(figure, tmp_path / "names.svg").read_text()
+    assert "cost $a_b$ and $\\frac$ 机器人" in text
+    assert "mathdefault" not in text
+    assert not [warning for warning in recwarn if "Glyph" in str(warning.message)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import EngFormatter, FixedLocator, MaxNLocator, PercentFormatter
 
 from merl.core import MerlError
@@ -180,7 +182,11 @@ def save(figure: Figure, output: Path) -> Path:
     metadata = {"Date": None} if output.suffix == ".svg" else None
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        with rc_context(options):
+        with rc_context(options), warnings.catch_warnings():
+            # A name may have a letter that the font lacks; it is drawn as a box.
+            warnings.filterwarnings("ignore", "Glyph")
+            for text in figure.findobj(Text):
+                text.set_parse_math(False)  # a `$` in a name is a `$`
             figure.savefig(part, metadata=metadata)
         part.replace(output)
     except (OSError, ValueError) as error:  # ValueError: a suffix that matplotlib does not know

@@ -4,8 +4,8 @@
     merl run runs/RUN --env lerobot_arm:make_unpaced --hz 15
 
 Fill in `connect` for your arm. docs/howto/real_robot.md explains the whole way. An action changes
-the joints' targets by at most `STEP`; targets never leave `LOW` to `HIGH`, and a step begins with
-targets at most `LEAD` from the joints.
+the joints' targets by at most `STEP`; targets never leave `LOW` to `HIGH`, and every change begins
+from targets at most `LEAD` from the joints. A reset moves to `REST` in the same small changes.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ HIGH |= {"wrist_roll": 90.0, "gripper": 60.0}
 REST |= {"wrist_roll": 0.0, "gripper": 30.0}
 STEP = 3.0
 LEAD = 10.0
+PATIENCE = 10 * HZ  # steps in which the arm must reach its rest position
 
 
 class Robot(Protocol):
@@ -47,7 +48,7 @@ class Robot(Protocol):
         ...
 
     def disconnect(self) -> None:
-        """Let the arm go."""
+        """End the connection; SO-101's driver then turns the motors off."""
         ...
 
 
@@ -93,10 +94,18 @@ class LeRobotArm(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         """Move slowly to the rest position, and wait for the person."""
         super().reset(seed=seed)
         _, here = self._observe()
-        self._target = here.clip(self._low, self._high)
-        while np.abs(self._target - self._rest).max() > 0:
-            self._move(self._rest - self._target)
+        self._target = here
+        for _ in range(PATIENCE):
+            self._move(self._rest - self._target, bounded=False)
             time.sleep(1 / HZ)
+            _, here = self._observe()
+            self._target = self._target.clip(here - LEAD, here + LEAD)
+            if np.abs(here - self._rest).max() <= LEAD and (self._target == self._rest).all():
+                break
+        else:
+            raise RuntimeError(
+                f"the arm does not reach its rest position: it is at {here.round(1)}"
+            )
         self._ready()
         self._next = time.perf_counter()
         return self._observe()[0], {}
@@ -115,12 +124,13 @@ class LeRobotArm(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         return observation, float(solved), solved, False, {"success": solved}
 
     def close(self) -> None:
-        """Let the arm go, as its driver does."""
+        """End the connection, which leaves the arm as its driver does."""
         self._robot.disconnect()
 
-    def _move(self, change: NDArray[Any]) -> None:
-        target = self._target + change.clip(-STEP, STEP)
-        self._target = target.clip(self._low, self._high)
+    def _move(self, change: NDArray[Any], *, bounded: bool = True) -> None:
+        self._target = self._target + change.clip(-STEP, STEP)
+        if bounded:  # a reset comes from wherever the arm is
+            self._target = self._target.clip(self._low, self._high)
         named = zip(self._joints, self._target.tolist(), strict=True)
         self._robot.send_action({f"{name}.pos": value for name, value in named})
 
@@ -156,19 +166,25 @@ def connect() -> Robot:
 
 def make_env() -> gymnasium.Env[Any, Any]:
     """Make the environment for training; a person resets the scene and ends solved episodes."""
-    return _make(paced=True)
+    ready = "Reset the scene and press Enter; a second Enter says that the task is solved. "
+    return _make(lambda: input(ready), _enter_pressed, paced=True)
 
 
 def make_unpaced() -> gymnasium.Env[Any, Any]:
-    """Make the environment for `merl run`, which keeps the time."""
-    return _make(paced=False)
+    """Make the environment for `merl run`, which keeps the time and reads the keys."""
+    ready = "Reset the scene and press Enter. "
+    return _make(lambda: input(ready), lambda: False, paced=False)
 
 
-def _make(*, paced: bool) -> gymnasium.Env[Any, Any]:
-    def ready() -> None:
-        input("Reset the scene and press Enter; a second Enter says that the task is solved. ")
-
-    return TimeLimit(LeRobotArm(connect(), ready, _enter_pressed, paced=paced), EPISODE)
+def _make(
+    ready: Callable[[], object], solved: Callable[[], bool], *, paced: bool
+) -> gymnasium.Env[Any, Any]:
+    robot = connect()
+    try:
+        return TimeLimit(LeRobotArm(robot, ready, solved, paced=paced), EPISODE)
+    except BaseException:
+        robot.disconnect()
+        raise
 
 
 def _enter_pressed() -> bool:

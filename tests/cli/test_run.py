@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import pty
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -19,6 +21,11 @@ from merl.demos.demonstrations import Demonstrations
 
 POLICY = "pretrained/reach_duplo"
 ROBOT = """
+import time
+
+import gymnasium
+import numpy as np
+
 import merl
 
 def arm():
@@ -29,6 +36,31 @@ def small():
 
 def blind():
     return merl.make_env("reach_duplo", observations=("proprio",))
+
+class Slow(gymnasium.Wrapper):
+    def reset(self, **options):
+        time.sleep(60)  # waits for a person
+
+    def close(self):
+        print("CLOSED", flush=True)
+
+def slow():
+    return Slow(arm())
+
+class Failing(gymnasium.Wrapper):
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps > 3:
+            raise RuntimeError("servo 3 does not answer")
+        return self.env.step(action)
+
+def failing():
+    return Failing(arm())
+
+def strong():
+    return gymnasium.wrappers.RescaleAction(arm(), np.float32(-50), np.float32(50))
 """
 
 
@@ -108,15 +140,59 @@ def test_late_steps_end_the_run(robot: str, capsys: pytest.CaptureFixture[str]) 
     assert "stopped: 5 steps in a row missed the deadline" in flat(capsys.readouterr().out)
 
 
-def test_a_key_stops_it() -> None:
-    """Press space in a terminal, after the first line is shown."""
+def in_terminal(command: list[str], sends: list[bytes], folder: Path) -> tuple[int, str, bool]:
+    """Run a command in a terminal, and send keys after the first line that says how to stop.
+
+    Returns:
+        Its exit code, its output, and whether the terminal is afterwards as before.
+    """
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "merl.cli", "run", POLICY, "--hz", "20"]
-    with subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE, text=True) as process:
+    before = termios.tcgetattr(theirs)
+    with subprocess.Popen(
+        [sys.executable, "-m", "merl.cli", "run", *command],
+        stdin=theirs,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=folder,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(theirs, termios.TIOCSCTTY, 0),
+    ) as process:
         assert process.stdout is not None
-        assert "Space or Ctrl-C stops" in process.stdout.readline()
-        time.sleep(1.0)
-        os.write(ours, b" ")
+        shown = process.stdout.readline()
+        assert "Space or Ctrl-C stops" in shown
+        for keys in sends:
+            time.sleep(1.0)
+            os.write(ours, keys)
         out, _ = process.communicate(timeout=60)
-    assert process.returncode == 0
+    return process.returncode, shown + out, termios.tcgetattr(theirs) == before
+
+
+@pytest.mark.parametrize("keys", [b" ", b"xq", b"\x1b"])
+def test_a_key_stops_it(keys: bytes, tmp_path: Path) -> None:
+    code, out, restored = in_terminal([POLICY, "--hz", "20", "--episodes", "3"], [keys], tmp_path)
+    assert code == 0
     assert "stopped" in out
+    assert "episode 2" not in out
+    assert restored
+
+
+def test_a_signal_ends_a_reset_that_waits(robot: str, tmp_path: Path) -> None:
+    """The environment is closed, and the terminal is as before."""
+    command = [POLICY, "--env", f"{robot}:slow", "--hz", "20"]
+    code, out, restored = in_terminal(command, [b"\x03"], tmp_path)
+    assert code == 128 + 2
+    assert "CLOSED" in out
+    assert restored
+
+
+def test_the_episode_of_a_failure_is_kept(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["run", POLICY, "--env", f"{robot}:failing", "--hz", "500", "--log", "log"]
+    assert main([*command, "--max-late", "1000"]) != 0
+    assert "servo 3" in flat(capsys.readouterr().err)
+    assert [line.steps for line in Demonstrations.open(Path("log")).lines] == [3]
+
+
+def test_actions_in_other_units_are_refused(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", POLICY, "--env", f"{robot}:strong", "--log", "log"]) != 0
+    assert "an action would be another movement" in flat(capsys.readouterr().err)
+    assert not Path("log").exists()

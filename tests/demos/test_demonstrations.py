@@ -155,7 +155,7 @@ def damage(folder: Path, how: str) -> None:
         ("missing", "00001.npz cannot be read"),
         ("not an archive", "00001.npz cannot be read"),
         ("NaN", "00001.npz contains NaN or infinity"),
-        ("length", "observation 'image' is uint8"),
+        ("length", "has . steps, and demos.json says"),
         ("key", "demos.json is damaged"),
         ("format", "has format 9, and this version reads format 1"),
         ("folder outside", "demos/secret.npz cannot be read"),

@@ -10,7 +10,8 @@ import pytest
 from gymnasium import spaces
 
 from merl.core import NotFinite
-from merl.evaluation.realtime import Limits, drive
+from merl.demos.episode import EpisodeRecording
+from merl.evaluation.realtime import Driven, Limits, drive
 
 
 class Clock:
@@ -50,53 +51,58 @@ class Robot(gymnasium.Env[Any, Any]):
         return {"joint": joint}, 0.5, count == self.ends, False, {"success": count == self.ends}
 
 
-def run(robot: Robot, limits: Limits, **options: Any) -> Any:
+def run(robot: Robot, limits: Limits, **options: Any) -> tuple[Driven, EpisodeRecording]:
     values = {"act": lambda _: np.array([1.0, -1.0]), "stop": lambda: False} | options
-    return drive(
+    observation, _ = robot.reset()
+    recording = EpisodeRecording(observation)
+    found = drive(
         values["act"],
         robot,
+        observation,
+        recording,
         10.0,
         limits,
         values["stop"],
         sleep=robot.clock.sleep,
         clock=robot.clock,
     )
+    return found, recording
 
 
 def test_steps_begin_at_the_rate_and_a_late_one_shifts_the_schedule() -> None:
     clock = Clock()
     robot = Robot(clock, [0.03, 0.03, 0.25, 0.03], ends=6)
-    found = run(robot, Limits())
+    found, recording = run(robot, Limits())
     assert robot.begun == pytest.approx([0.0, 0.1, 0.2, 0.45, 0.55, 0.65])
     assert found.end == "terminated"
     assert found.timing.lateness == pytest.approx([0, 0, 0.15, 0, 0, 0], abs=1e-9)
     assert found.timing.late == 1
     assert found.timing.env == pytest.approx([0.03, 0.03, 0.25, 0.03, 0.03, 0.03])
-    assert found.episode.terminated
-    assert found.episode.success
-    assert found.episode.observations["joint"].shape == (7, 2)
+    episode = recording.finish(terminated=True)
+    assert episode.success
+    assert episode.observations["joint"].shape == (7, 2)
 
 
 def test_actions_stay_within_the_limits() -> None:
     robot = Robot(Clock(), [0.01], ends=5)
-    found = run(robot, Limits(action=0.5, change=0.2))
+    episode = run(robot, Limits(action=0.5, change=0.2))[1].finish(terminated=True)
     np.testing.assert_allclose([a[0] for a in robot.actions], [0.2, 0.4, 0.5, 0.5, 0.5])
     np.testing.assert_allclose([a[1] for a in robot.actions], [-0.2, -0.4, -0.5, -0.5, -0.5])
-    np.testing.assert_array_equal(found.episode.actions, robot.actions)
-    np.testing.assert_array_equal(found.episode.intended, [[1.0, -1.0]] * 5)
+    np.testing.assert_array_equal(episode.actions, robot.actions)
+    np.testing.assert_array_equal(episode.intended, [[1.0, -1.0]] * 5)
 
 
 def test_what_ends_an_episode() -> None:
-    assert run(Robot(Clock(), [0.01]), Limits(steps=7)).end == "time"
-    late = run(Robot(Clock(), [0.2]), Limits(late=4))
-    assert (late.end, len(late.episode)) == ("late", 4)
+    assert run(Robot(Clock(), [0.01]), Limits(steps=7))[0].end == "time"
+    late, recording = run(Robot(Clock(), [0.2]), Limits(late=4))
+    assert (late.end, len(recording)) == ("late", 4)
     # Every other step is in time.
-    assert run(Robot(Clock(), [0.2, 0.01]), Limits(late=2, steps=30)).end == "time"
+    assert run(Robot(Clock(), [0.2, 0.01]), Limits(late=2, steps=30))[0].end == "time"
     asked = iter([False, False, True])
-    stopped = run(Robot(Clock(), [0.01]), Limits(), stop=lambda: next(asked))
-    assert (stopped.end, len(stopped.episode)) == ("stopped", 2)
+    stopped, recording = run(Robot(Clock(), [0.01]), Limits(), stop=lambda: next(asked))
+    assert (stopped.end, len(recording)) == ("stopped", 2)
     robot = Robot(Clock(), [0.01])
-    assert run(robot, Limits(), stop=lambda: True) is None
+    assert len(run(robot, Limits(), stop=lambda: True)[1]) == 0
     assert robot.begun == []
 
 

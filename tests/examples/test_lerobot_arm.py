@@ -74,8 +74,9 @@ def test_targets_keep_their_limits(module: types.ModuleType) -> None:
     env.reset()
     rest = [module.REST[name] for name in module.REST]
     assert list(robot.sent[-1].values()) == rest
-    steps = np.diff([list(sent.values()) for sent in robot.sent], axis=0)
-    assert np.abs(steps).max() <= module.STEP + 1e-9  # also on the way to rest
+    path = [[7.0] * 6, *(list(sent.values()) for sent in robot.sent)]
+    assert np.abs(np.diff(path, axis=0)).max() <= module.STEP + 1e-9
+    robot.sent.clear()
     for sign in (1.0, -1.0):
         for _ in range(80):
             before = np.array([robot.at[name] for name in module.REST])
@@ -86,6 +87,22 @@ def test_targets_keep_their_limits(module: types.ModuleType) -> None:
         assert list(robot.sent[-1].values()) == [bound[name] for name in module.REST]
     env.close()
     assert not robot.connected
+
+
+def test_a_reset_begins_where_the_arm_is_and_notices_when_it_is_stuck(
+    module: types.ModuleType,
+) -> None:
+    env, robot = arm(module)
+    robot.at["shoulder_pan"] = 110.0  # out of bounds
+    env.reset()
+    path = [110.0, *(sent["shoulder_pan.pos"] for sent in robot.sent)]
+    assert np.abs(np.diff(path)).max() <= module.STEP + 1e-9
+    env, robot = arm(module)
+    robot.send_action = lambda action: robot.sent.append(action)  # type: ignore[method-assign]
+    with pytest.raises(RuntimeError, match="does not reach its rest position"):
+        env.reset()
+    targets = np.array([list(sent.values()) for sent in robot.sent])
+    assert np.abs(targets - 7.0).max() <= module.LEAD + module.STEP + 1e-9
 
 
 def test_the_whole_way_runs(

@@ -144,7 +144,7 @@ class ExportOptions(FolderOptions):
     """Format: a LeRobotDataset v3, an HDF5 file of robomimic, or a dataset of Minari."""
     out: Path | None = None
     """The new folder or file; by default DIR-FORMAT, or DIR.hdf5."""
-    rate: Annotated[float, Range(0, without=0)] | None = None
+    rate: Annotated[float, Range(0, 1000, without=0)] | None = None
     """Steps per second; by default those of the task, if it is one of merl's."""
     lossless: tyro.conf.FlagCreatePairsOff[bool] = False
     """Store the images of a LeRobotDataset as PNG, in place of videos."""
@@ -266,7 +266,7 @@ def import_(args: list[str]) -> int:
             f"the source compressed {', '.join(names)} with loss: its frames are kept as decoded",
             highlight=False,
         )
-    _tell_line(console, options, preset)
+    _tell_line(console, options, preset, tuple(kept) if options.leave_out else ())
     return 0
 
 
@@ -280,7 +280,8 @@ def export(args: list[str]) -> int:
         rate = frame_rate(made.metadata)
         made.close()
     ending = ".hdf5" if options.to == "robomimic" else f"-{options.to}"
-    out = options.out or options.folder.with_name(options.folder.name + ending)
+    folder = options.folder.absolute()
+    out = options.out or folder.with_name(folder.name + ending)
     console = make_console()
     with console.status("exporting", spinner="line"):
         export_demos(found, options.to, out, rate, lossless=options.lossless)
@@ -331,9 +332,9 @@ def _describe(console: Console, demos: Demonstrations) -> None:
         say(f"success at the end in {sum(told)} of {len(told)}")
 
 
-def _tell_line(console: Console, options: Any, preset: str) -> None:
-    """Print the command that learns from the demonstrations."""
-    given: list[str] = []
+def _tell_line(console: Console, options: Any, preset: str, keys: tuple[str, ...] = ()) -> None:
+    """Print the command that learns from the demonstrations, with these keys alone."""
+    given: list[str] = flags("agent.keys", keys) if keys else []
     if options.task in ENV_IDS:
         usual = compose(preset, "reach_duplo").env
         for each in dataclasses.fields(EnvConfig):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import select
+import signal
 import sys
 import termios
 import tty
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,23 +20,27 @@ import tyro
 from gymnasium import spaces
 from rich.console import Console
 
+from merl.acting.run_env import own_bounds
 from merl.cli.output import make_console
 from merl.cli.parsing import RunOptions, parse
 from merl.cli.running import tell_trusted
 from merl.core import MerlError, counted
 from merl.core.fields import Range
-from merl.core.signals import Interrupt
+from merl.core.signals import Stopped
+from merl.demos.episode import Episode, EpisodeRecording
 from merl.demos.recorder import Recorder
 from merl.envs.frame_rate import frame_rate
 from merl.envs.user_env import load_module, make_user_env
 from merl.evaluation.exported import SUFFIXES, ExportedPolicy
 from merl.evaluation.policy import Policy, load_policy
 from merl.evaluation.realtime import Driven, Limits, check_rate, drive
+from merl.runs import record
 from merl.runs.plain import describe, told
 from merl.runs.run import Run
 
-STOP_KEYS = " q\x1b\r\n"
-"""Space, q, Escape and Enter."""
+STOP_KEYS = b" q\x1b"
+"""Space, q and Escape."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,8 @@ class RunPolicyOptions(RunOptions):
     action_limit: Annotated[float, Range(0, 1, without=0)] = 1.0
     """Largest absolute value of an action's numbers, of 1."""
     rate_limit: Annotated[float, Range(0, 2, without=0)] | None = None
-    """Largest change of an action's numbers from step to step; the first counts from 0."""
+    """Largest change of an action's numbers from step to step, for actions that are speeds or
+    changes: the first counts from 0."""
     max_late: Annotated[int, Range(1)] = 25
     """Consecutive steps that miss their deadline, after which the run ends."""
     log: Path | None = None
@@ -85,35 +92,89 @@ def run(args: list[str]) -> int:
             who = f"policy {options.run}"
             recorder = Recorder(log, name, who, env.observation_space, env.action_space)
         policy(env.observation_space.sample())  # the first call takes longer
-        interrupt = stack.enter_context(Interrupt().listening())
-        pressed = stack.enter_context(key_pressed())
-        _tell(console, f"{options.run} in {name}, {rate:g} steps per second: Space or Ctrl-C stops")
-        stopped, code = False, 0
+        stop = stack.enter_context(Stop.listening())
+        _tell(console, f"{options.run} in {name}, {rate:g} steps per second: {stop.keys} stops")
+        code = 0
         for index in range(options.episodes):
-            found = drive(
-                policy,
-                env,
-                rate,
-                limits,
-                lambda: interrupt.number is not None or pressed(),
-                reset=policy.reset,
-            )
-            if found is None:
-                _tell(console, "stopped before the first step")
+            if stop.asked():
                 break
-            if recorder is not None:
-                recorder.add(found.episode)
-            _tell(console, f"episode {index + 1}: {_told(found)}")
-            stopped = found.end == "stopped"
+            with stop.at_once():
+                observation, _ = env.reset()
+            policy.reset()
+            recording, terminated = EpisodeRecording(observation), False
+            try:
+                found = drive(policy, env, observation, recording, rate, limits, stop.asked)
+                terminated = found.end == "terminated"
+            finally:  # also after an error, whose episode is the most interesting
+                if recorder is not None and len(recording):
+                    recorder.add(recording.finish(terminated=terminated))
+            if len(recording):
+                episode = recording.finish(terminated=terminated)
+                _tell(console, f"episode {index + 1}: {_told(episode, found)}")
             if found.end == "late":
                 message = f"{counted(options.max_late, 'step')} in a row missed the deadline"
                 _tell(console, f"stopped: {message}: use a lower --hz")
                 code = 1
-            if stopped or code:
                 break
-        if log is not None:
+        if not len(recording):
+            _tell(console, "stopped before the first step")
+        if recorder is not None and recorder.demonstrations.lines:
             _tell(console, f"log: {log}")
-    return 128 + interrupt.number if interrupt.number is not None else code
+    return 128 + stop.number if stop.number else code
+
+
+class Stop:
+    """Requests to stop: a key in the terminal, or a signal; a second signal raises at once.
+
+    Attributes:
+        number: the signal; 0 if none arrived.
+        keys: what stops, in words.
+    """
+
+    def __init__(self, terminal: int | None) -> None:
+        self.number, self._pressed, self._raises, self._terminal = 0, False, False, terminal
+        self.keys = "Ctrl-C" if terminal is None else "Space or Ctrl-C"
+
+    @classmethod
+    @contextmanager
+    def listening(cls) -> Iterator[Stop]:
+        """Listen to signals, and to the keys of the terminal if there is one."""
+        terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
+        stop = cls(terminal)
+        former = {number: signal.signal(number, stop.note) for number in SIGNALS}
+        before = None if terminal is None else termios.tcgetattr(terminal)
+        try:
+            if terminal is not None:
+                tty.setcbreak(terminal)
+            yield stop
+        finally:
+            for number, handler in former.items():
+                signal.signal(number, handler)
+            if terminal is not None and before is not None:
+                with suppress(termios.error):  # the terminal was closed
+                    termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+    def note(self, number: int, _: object) -> None:
+        """Note a signal; raise the second one, and any in `at_once`."""
+        second, self.number = bool(self.number), number
+        if second or self._raises:
+            raise Stopped(number)
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Let signals raise, in calls that may wait for long."""
+        self._raises = True
+        try:
+            yield
+        finally:
+            self._raises = False
+
+    def asked(self) -> bool:
+        """Return whether to stop."""
+        if self._terminal is not None and select.select([self._terminal], [], [], 0)[0]:
+            keys = os.read(self._terminal, 4096)
+            self._pressed |= not keys or any(key in STOP_KEYS for key in keys)
+        return self._pressed or self.number != 0
 
 
 def check_fits(policy: Policy | ExportedPolicy, env: gymnasium.Env[Any, Any]) -> None:
@@ -137,34 +198,23 @@ def check_fits(policy: Policy | ExportedPolicy, env: gymnasium.Env[Any, Any]) ->
                 f"{trained}"
             )
     if isinstance(policy, ExportedPolicy):
-        size = policy.action_size
+        bounds = policy.bounds
     else:
         assert policy.run is not None
-        (size,) = policy.run.spaces()[1].shape
+        size = policy.run.spaces()[1].shape[0]
+        recorded = record.read(policy.run.path)["action_space"].get("own_bounds")
+        bounds = recorded or ([-1.0] * size, [1.0] * size)
+    size = len(bounds[0])
     if env.action_space.shape != (size,):
         raise MerlError(
             f"the environment's actions are {env.action_space.shape}, and the policy's ({size},)"
         )
-
-
-@contextmanager
-def key_pressed() -> Iterator[Callable[[], bool]]:
-    """Give a function that returns whether a stop key was pressed in the terminal."""
-    if not sys.stdin.isatty():
-        yield lambda: False
-        return
-    file = sys.stdin.fileno()
-    before = termios.tcgetattr(file)
-
-    def pressed() -> bool:
-        ready, _, _ = select.select([file], [], [], 0)
-        return bool(ready) and sys.stdin.read(1) in STOP_KEYS
-
-    try:
-        tty.setcbreak(file)
-        yield pressed
-    finally:
-        termios.tcsetattr(file, termios.TCSADRAIN, before)
+    here = own_bounds(env) or ([-1.0] * size, [1.0] * size)
+    if not np.allclose(here, bounds):
+        raise MerlError(
+            f"the environment's actions reach from {here[0]} to {here[1]}, and those that the "
+            f"policy learnt from {bounds[0]} to {bounds[1]}: an action would be another movement"
+        )
 
 
 def _policy(options: RunPolicyOptions) -> Policy | ExportedPolicy:
@@ -184,7 +234,8 @@ def _env(options: RunPolicyOptions, policy: Policy | ExportedPolicy) -> gymnasiu
     if options.env is not None:
         if ":" in options.env:
             load_module(options.env, Path.cwd())
-        return make_user_env(options.env)
+        known = policy.config.user_env if isinstance(policy, Policy) else None
+        return make_user_env(options.env, config=known)
     if isinstance(policy, ExportedPolicy):
         raise MerlError(f"{options.run} is a file of a policy: name the environment with --env")
     return policy.make_env(trust=options.trust)
@@ -199,12 +250,12 @@ def _tell(console: Console, line: str) -> None:
     console.print(line, highlight=False, soft_wrap=True)
 
 
-def _told(found: Driven) -> str:
+def _told(episode: Episode, found: Driven) -> str:
     """Return one line about an episode: its return, its end, and its times."""
-    times, steps = found.timing, len(found.episode)
-    words = f"return {found.episode.rewards.sum():.4g} in {counted(steps, 'step')}, {found.end}"
-    if found.episode.success is not None:
-        words += ", success" if found.episode.success else ", no success"
+    times = found.timing
+    words = f"return {episode.rewards.sum():.4g} in {counted(len(episode), 'step')}, {found.end}"
+    if episode.success is not None:
+        words += ", success" if episode.success else ", no success"
     for name, values in (("policy", times.policy), ("environment", times.env)):
         middle, worst = 1000 * np.percentile(values, 50), 1000 * max(values)
         words += f"; {name} {middle:.1f} ms (at most {worst:.1f})"

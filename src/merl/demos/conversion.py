@@ -5,8 +5,9 @@ Nothing is written unless every episode fits.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,12 +18,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from merl.core import MerlError, counted, suggest
+from merl.core.user_code import in_one_line
 from merl.demos.demonstrations import Demonstrations
-from merl.demos.episode import Episode
+from merl.demos.episode import Episode, check_episode
 from merl.demos.lerobot_reader import INFO, LeRobotDataset
 from merl.demos.lerobot_writer import lerobot_name, write_lerobot
 from merl.demos.minari_data import MinariData, write_minari
-from merl.demos.recorder import Recorder
+from merl.demos.recorder import Recorder, check_free
 from merl.demos.robomimic import RobomimicFile, write_robomimic
 from merl.demos.source import Feature, RawEpisode, Source
 
@@ -79,14 +81,19 @@ def open_source(path: Path) -> Source:
     Raises:
         MerlError: it is in none of them, or damaged.
     """
-    if (path / INFO).is_file():
-        return LeRobotDataset(path)
-    if (path / "data").is_dir() and (path / "data" / "metadata.json").is_file():
-        return MinariData(path)
-    if path.is_file():
-        return RobomimicFile(path)
-    if not path.exists():
-        raise MerlError(f"{path} does not exist")
+    try:
+        if (path / INFO).is_file():
+            return LeRobotDataset(path)
+        if (path / "data" / "metadata.json").is_file():
+            return MinariData(path)
+        if path.is_file():
+            return RobomimicFile(path)
+        if not path.exists():
+            raise MerlError(f"{path} does not exist")
+    except MerlError:
+        raise
+    except Exception as error:  # a damaged file makes a package raise anything
+        raise MerlError(f"{path} cannot be read: {in_one_line(error)}") from None
     raise MerlError(
         f"{path} is neither a LeRobotDataset v3 (it has no {INFO}), nor a dataset of Minari (it "
         "has no data/metadata.json), nor an HDF5 file of robomimic"
@@ -105,15 +112,16 @@ def import_demos(source: Source, out: Path, target: Target, rules: Rules) -> Dem
     Raises:
         MerlError: the source does not fit the environment or is damaged; nothing is written.
     """
-    keys = matched(source, target, rules)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise MerlError(f"{out} is not empty: name another folder with --out")
+    if not source.count:
+        raise MerlError(f"{source.path} holds no episode")
+    keys, out = matched(source, target, rules), out.absolute()
+    check_free(out)
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     made = f"{source.format} {source.path.name}"
     try:
         recorder = Recorder(part, target.task, made, target.observation_space, target.action_space)
-        for raw in source.episodes(tuple(dict.fromkeys(keys.values()))):
+        for raw in _read(source, tuple(dict.fromkeys(keys.values()))):
             recorder.add(converted(raw, source, keys, target, rules))
         if out.exists():
             out.rmdir()
@@ -123,6 +131,16 @@ def import_demos(source: Source, out: Path, target: Target, rules: Rules) -> Dem
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return Demonstrations.open(out)
+
+
+def _read(source: Source, keys: tuple[str, ...]) -> Iterator[RawEpisode]:
+    """Read the episodes of a source; whatever a package raises becomes one line."""
+    try:
+        yield from source.episodes(keys)
+    except MerlError:
+        raise
+    except Exception as error:
+        raise MerlError(f"{source.path} cannot be read: {in_one_line(error)}") from None
 
 
 def matched(source: Source, target: Target, rules: Rules) -> dict[str, str]:
@@ -186,7 +204,7 @@ def converted(
         space, value = target.observation_space[key], raw.observations[name]
         if len(value) not in (steps, steps + 1):
             raise MerlError(f"{where}: {name!r} has {len(value)} values, and {steps} actions")
-        value = _fitted(f"{where}: {name!r}", value, space)
+        value = _fitted(f"{where}: {name!r}", value, space, resize=rules.resize)
         observations[key] = value if len(value) > steps else np.concatenate([value, value[-1:]])
     actions = _scaled(where, raw.actions, target, rules)
     rewards = raw.rewards
@@ -202,11 +220,7 @@ def converted(
         bool(raw.terminated),
         raw.success,
     )
-    numbers = [*observations.values(), episode.actions, episode.intended, episode.rewards]
-    if any(each.dtype.kind == "f" and not np.isfinite(each).all() for each in numbers):
-        raise MerlError(f"{where} contains NaN or infinity")
-    if len(rewards) != steps:
-        raise MerlError(f"{where} has {len(rewards)} rewards and {steps} actions")
+    check_episode(where, episode, target.observation_space, target.action_space)
     return episode
 
 
@@ -227,6 +241,7 @@ def export_demos(
     """
     if not demos.lines:
         raise MerlError(f"{demos.path} holds no episode")
+    out = out.absolute()
     if out.exists():
         raise MerlError(f"{out} exists: name another with --out")
     if form == "lerobot" and rate is None:
@@ -252,10 +267,11 @@ def export_demos(
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _name_of(key: str, source: Source) -> str:
@@ -287,23 +303,31 @@ def _flat(shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(size for size in shape if size != 1)
 
 
-def _fitted(what: str, value: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
+def _fitted(
+    what: str, value: NDArray[Any], space: spaces.Space[Any], *, resize: bool
+) -> NDArray[Any]:
     """Return values with shape and type of a space, checked against its bounds."""
     assert isinstance(space, spaces.Box)
-    if value.shape[1:] != space.shape:
-        if value.ndim == 4 and value.dtype == np.uint8:
-            height, width = space.shape[:2]
-            value = np.stack([_resized(frame, height, width) for frame in value])
-        value = value.reshape(len(value), *space.shape)
-    value = value.astype(space.dtype, copy=False)
+    whole = np.issubdtype(space.dtype, np.integer)
+    if value.dtype.kind not in ("biu" if whole else "biuf"):
+        raise MerlError(f"{what} is {value.dtype}, and the observation {space.dtype}")
+    if value.ndim == 4 and value.dtype == np.uint8 and value.shape[1:] != space.shape and resize:
+        height, width = space.shape[:2]
+        value = np.stack([_resized(frame, height, width) for frame in value])
+    if _flat(value.shape[1:]) != _flat(space.shape):
+        raise MerlError(
+            f"{what} has the shape {value.shape[1:]}, and the observation {space.shape}"
+            + (": resize images with --resize" if value.ndim == 4 else "")
+        )
+    value = value.reshape(len(value), *space.shape)
     below, above = (value < space.low).any(), (value > space.high).any()
     if below or above:
-        worst = value.min() if below else value.max()
+        worst = float(value.min() if below else value.max())
         raise MerlError(
             f"{what} is {worst:g} somewhere, which is outside of the observation's bounds, "
             f"[{space.low.min():g}, {space.high.max():g}]: its unit differs"
         )
-    return value
+    return value.astype(space.dtype, copy=False)
 
 
 def _resized(frame: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:

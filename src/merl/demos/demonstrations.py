@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium import spaces
 
 from merl.core import MerlError, Transition, counted
-from merl.demos.episode import Episode
+from merl.demos.episode import Episode, check_episode
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.replay.mixing import INTENDED
 from merl.runs.plain import box, describe, told
@@ -132,24 +132,11 @@ class Demonstrations:
             *(zipfile.BadZipFile, zlib.error),
         ) as error:
             raise MerlError(f"{file} cannot be read: {error}: record it again") from None
-        for key, space in self.observation_space.spaces.items():
-            expected, values = (line.steps + 1, *(space.shape or ())), observations[key]
-            if values.shape != expected or values.dtype != space.dtype:
-                raise MerlError(
-                    f"{file}: observation {key!r} is {values.dtype} {values.shape}, but {INDEX} "
-                    f"says {space.dtype} {expected}"
-                )
-        if rewards.shape != (line.steps,) or rewards.dtype.kind != "f":
-            raise MerlError(f"{file}: rewards are {rewards.dtype} {rewards.shape}")
-        for each in (actions, intended):
-            if each.shape != (line.steps, *self.action_space.shape) or each.dtype.kind != "f":
-                raise MerlError(f"{file}: actions are {each.dtype} {each.shape}")
-            if np.abs(each).max(initial=0.0) > 1.0:
-                raise MerlError(f"{file}: actions are beyond [-1, 1]: rescale them")
-        numbers = (actions, intended, rewards, *observations.values())
-        if any(each.dtype.kind == "f" and not np.isfinite(each).all() for each in numbers):
-            raise MerlError(f"{file} contains NaN or infinity: remove it from {INDEX}")
-        return Episode(observations, actions, intended, rewards, terminated, line.success)
+        episode = Episode(observations, actions, intended, rewards, terminated, line.success)
+        if len(episode) != line.steps:
+            raise MerlError(f"{file} has {len(episode)} steps, and {INDEX} says {line.steps}")
+        check_episode(str(file), episode, self.observation_space, self.action_space)
+        return episode
 
     def digest(self) -> str:
         """Return the SHA-256 of the index and of all episodes."""

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
-from merl.core import Observation
+from merl.core import MerlError, Observation
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,46 @@ class Episode:
     def __len__(self) -> int:
         """Return the number of steps."""
         return len(self.actions)
+
+
+def check_episode(
+    where: str, episode: Episode, observation_space: spaces.Dict, action_space: spaces.Box
+) -> None:
+    """Check that an episode is one of an environment with these spaces.
+
+    Args:
+        where: its file or name, for messages.
+        episode: the episode.
+        observation_space: the environment's observations.
+        action_space: its actions.
+
+    Raises:
+        MerlError: a value has another shape or type, or is out of range, NaN or infinite.
+    """
+    steps = len(episode)
+    for key, space in observation_space.spaces.items():
+        expected, values = (steps + 1, *(space.shape or ())), episode.observations[key]
+        if values.shape != expected or values.dtype != space.dtype:
+            raise MerlError(
+                f"{where}: observation {key!r} is {values.dtype} {values.shape}, not "
+                f"{space.dtype} {expected}"
+            )
+    if episode.rewards.shape != (steps,) or episode.rewards.dtype.kind != "f":
+        raise MerlError(
+            f"{where}: rewards are {episode.rewards.dtype} {episode.rewards.shape}, not one number "
+            f"for each of {steps} steps"
+        )
+    for each in (episode.actions, episode.intended):
+        if each.shape != (steps, *action_space.shape) or each.dtype.kind != "f":
+            raise MerlError(
+                f"{where}: actions are {each.dtype} {each.shape}, not "
+                f"{(steps, *action_space.shape)}"
+            )
+        if np.abs(each).max(initial=0.0) > 1.0:
+            raise MerlError(f"{where}: actions are beyond [-1, 1]: rescale them")
+    numbers = (episode.actions, episode.intended, episode.rewards, *episode.observations.values())
+    if any(each.dtype.kind == "f" and not np.isfinite(each).all() for each in numbers):
+        raise MerlError(f"{where} contains NaN or infinity: leave the episode out")
 
 
 class EpisodeRecording:

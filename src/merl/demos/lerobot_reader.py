@@ -47,13 +47,15 @@ class LeRobotDataset:
         try:
             self._info = info
             self.rate: float | None = float(info["fps"])
+            if not 0 < self.rate < float("inf"):
+                raise ValueError(f"fps {self.rate}")
             features = {
                 str(key): (str(value["dtype"]), tuple(int(n) for n in value["shape"]))
                 for key, value in info["features"].items()
             }
             self._patterns = str(info["data_path"]), info.get("video_path")
             (self.action_size,) = features[ACTION][1]
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise MerlError(f"{path / INFO} is damaged: {error!r}") from None
         self._stored = features
         self.features: Mapping[str, Feature] = {
@@ -164,7 +166,7 @@ class LeRobotDataset:
         if key not in videos or videos[key].path != file:
             videos[key] = _Frames(file)
         begin, rate = row.get(f"videos/{key}/from_timestamp"), self.rate
-        if not isinstance(begin, int | float) or rate is None:
+        if not isinstance(begin, int | float) or not np.isfinite(begin) or rate is None:
             raise MerlError(f"{self.path}: the index of {name} has no time of {key!r}")
         return np.stack([videos[key].at(begin + i / rate, 0.5 / rate) for i in range(length)])
 

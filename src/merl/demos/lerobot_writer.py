@@ -42,8 +42,6 @@ EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 TIMES = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64"}
 TIMES |= {"index": "int64", "task_index": "int64"}
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-SAMPLED = 20
-"""Frames of an episode whose pixels enter the statistics."""
 
 
 def lerobot_name(key: str, image: bool) -> str:
@@ -102,7 +100,10 @@ class _Writer:
         size = demos.action_space.shape[0]
         own = {ACTION: ("float32", (size,)), INTENDED: ("float32", (size,))}
         own |= {REWARD: ("float32", (1,))}
-        own |= dict.fromkeys((DONE, SUCCESS, TERMINATED), ("bool", (1,)))
+        # Without the feature, success is not known.
+        self.knows = all(line.success is not None for line in demos.lines)
+        flags = (DONE, SUCCESS, TERMINATED) if self.knows else (DONE, TERMINATED)
+        own |= dict.fromkeys(flags, ("bool", (1,)))
         own |= {name: (kind, (1,)) for name, kind in TIMES.items()}
         self.features |= {name: _numbers(*value) for name, value in own.items()}
         self.videos = [k for k, name in self.keys.items() if self._kind(name) == "video"]
@@ -111,7 +112,7 @@ class _Writer:
         from pyarrow import parquet
 
         rows: list[dict[str, Any]] = []
-        statistics: dict[str, list[NDArray[Any]]] = {}
+        statistics: dict[str, list[NDArray[Any]]] = {}  # of images: counts of each pixel value
         first, schema = 0, self._schema()
         tables: Any = None
         streams: dict[str, _Video] = {}
@@ -153,7 +154,13 @@ class _Writer:
                 row |= {f"{name}/to_timestamp": streams[key].seconds}
             rows.append(row)
             for name, value in values.items():
-                statistics.setdefault(name, []).append(self._sampled(name, value))
+                if self._kind(name) not in ("image", "video"):
+                    statistics.setdefault(name, []).append(value.reshape(len(value), -1))
+                    continue
+                counts = np.stack(
+                    [np.bincount(v.ravel(), minlength=256) for v in np.rollaxis(value, 3)]
+                )
+                statistics[name] = [counts + (statistics[name][0] if name in statistics else 0)]
             first += len(episode)
         _close(tables, streams)
         self._write_index(rows, first, statistics)
@@ -196,9 +203,12 @@ class _Writer:
         self._path(INFO).write_text(json.dumps(info, indent=4) + "\n")
         statistics: dict[str, Any] = {}
         for name, parts in values.items():
-            found: dict[str, Any] = _statistics(np.concatenate(parts))
+            found: dict[str, Any]
             if self._kind(name) in ("image", "video"):
-                found = {key: _by_channel(value) for key, value in found.items()}
+                channels = [_statistics_of_counts(counts) for counts in parts[0]]
+                found = {key: [[[each[key]]] for each in channels] for key in channels[0]}
+            else:
+                found = _statistics(np.concatenate(parts).astype(np.float64))
             statistics[name] = found | {"count": [frames]}
         self._path("meta/stats.json").write_text(json.dumps(statistics, indent=4) + "\n")
 
@@ -208,8 +218,9 @@ class _Writer:
         last = np.arange(steps) == steps - 1
         values = {name: episode.observations[key][:steps] for key, name in self.keys.items()}
         values |= {ACTION: episode.actions, INTENDED: episode.intended, REWARD: episode.rewards}
-        values |= {DONE: last, SUCCESS: last & bool(episode.success)}
-        values |= {TERMINATED: last & episode.terminated}
+        values |= {DONE: last, TERMINATED: last & episode.terminated}
+        if self.knows:
+            values[SUCCESS] = last & bool(episode.success)
         numbers = np.arange(steps)
         values |= {
             "timestamp": numbers / self.rate,
@@ -219,13 +230,6 @@ class _Writer:
             "task_index": np.zeros(steps),
         }
         return values
-
-    def _sampled(self, name: str, value: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the values that enter the statistics, (N, size); pixels are in [0, 1]."""
-        if self._kind(name) in ("image", "video"):
-            pixels = value[:: max(1, len(value) // SAMPLED)]
-            return pixels.reshape(-1, pixels.shape[-1]) / 255.0
-        return value.reshape(len(value), -1).astype(np.float64)
 
     def _table(self, values: Mapping[str, NDArray[Any]], schema: Any) -> Any:
         import pyarrow
@@ -345,9 +349,16 @@ def _statistics(values: NDArray[Any]) -> dict[str, list[Any]]:
     return {name: value.tolist() for name, value in found.items()}
 
 
-def _by_channel(value: list[float]) -> list[list[list[float]]]:
-    """Return a number for each channel in LeRobot's form, (3, 1, 1)."""
-    return [[[each]] for each in value]
+def _statistics_of_counts(counts: NDArray[Any]) -> dict[str, float]:
+    """Return the statistics of pixels in [0, 1], from the counts of their 256 values."""
+    values, total = np.arange(256) / 255.0, counts.sum()
+    present, shares = np.flatnonzero(counts), np.cumsum(counts) / total
+    mean = float((values * counts).sum() / total)
+    found = {"min": float(values[present[0]]), "max": float(values[present[-1]]), "mean": mean}
+    found["std"] = float(np.sqrt((counts * (values - mean) ** 2).sum() / total))
+    return found | {
+        name: float(values[np.searchsorted(shares, share)]) for name, share in QUANTILES.items()
+    }
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:

@@ -18,7 +18,7 @@ from merl.runs.plain import describe
 
 
 class Recorder:
-    """Writer of a folder of demonstrations; the folder is complete after every episode.
+    """Writer of a folder of demonstrations, which is complete after every episode.
 
     Args:
         path: the folder, which must not exist or be empty.
@@ -40,12 +40,7 @@ class Recorder:
         action_space: spaces.Box,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            if any(path.iterdir()):
-                raise MerlError(f"{path} is not empty: name another folder with --out")
-        except OSError as error:
-            raise MerlError(f"{path} cannot be created: {error.strerror}") from None
+        check_free(path)
         self.demonstrations = Demonstrations(
             path, task, source, observation_space, action_space, (), options or {}
         )
@@ -69,12 +64,29 @@ class Recorder:
         arrays |= {"reward": episode.rewards, "terminated": np.array(episode.terminated)}
         part = demos.path / f".{INDEX}.part"
         try:
+            demos.path.mkdir(parents=True, exist_ok=True)
             np.savez_compressed(demos.path / name, **arrays)
             part.write_text(json.dumps(_index(whole), indent=1) + "\n")
             part.replace(demos.path / INDEX)
         except OSError as error:
             raise MerlError(f"{demos.path} cannot be written: {error.strerror}") from None
         self.demonstrations = whole
+
+
+def check_free(path: Path) -> None:
+    """Check that a folder can be written: it is empty, or can be created.
+
+    Raises:
+        MerlError: it holds files, or cannot be created.
+    """
+    try:
+        if not path.exists():
+            path.mkdir(parents=True)
+            path.rmdir()
+        elif any(path.iterdir()):
+            raise MerlError(f"{path} is not empty: name another folder")
+    except OSError as error:
+        raise MerlError(f"{path} cannot be created: {error.strerror}") from None
 
 
 def _index(demos: Demonstrations) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.core import EnvironmentFailed, MerlError, NotFinite, counted
+from merl.core.signals import Stopped
 from merl.core.user_code import in_one_line
 from merl.envs.config import UserEnvConfig
 from merl.envs.user_spaces import UserKey, action_bounds, advice, brief, is_depth, user_key
@@ -195,7 +196,8 @@ def failing(what: str) -> Iterator[None]:
     except MerlError:
         raise
     except BaseException as error:  # drivers call sys.exit, bindings raise unusual kinds
-        if isinstance(error, KeyboardInterrupt) and _ctrl_c_raises():
+        own = isinstance(error, Stopped)  # raised by merl's signal handler
+        if own or (isinstance(error, KeyboardInterrupt) and _ctrl_c_raises()):
             raise
         raise EnvironmentFailed(f"the environment's {what} raised {in_one_line(error)}") from error
 

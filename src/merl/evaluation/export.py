@@ -31,6 +31,8 @@ from merl.evaluation.to_numpy import numpy_program
 from merl.runs import record
 from merl.runs.plain import describe
 
+TOLERANCE = 1e-4
+"""Largest relative difference between the actions of the policy and of its exported form."""
 CALLS = 200
 """Calls of the latency's measurement."""
 
@@ -106,7 +108,7 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
     names = [*module.keys, *(key + FORMER for key in module.stacked)]
     outputs = ["action", *(key + NEXT for key in module.stacked)]
     arguments = tuple(torch.from_numpy(example[name]) for name in names)
-    part = output.with_name(f".{output.name}.part")
+    part = output.with_name(f".part-{output.name}")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         with torch.no_grad(), _quiet():
@@ -120,8 +122,9 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
                 title = f"A policy for {policy.config.task}, written by merl {merl.__version__}."
                 text = numpy_program(program, names, outputs, title, output.stem)
                 part.write_text(text)
+        run = load_exported(part, names, outputs)
+        _check_same(module, run, example, arguments)
         part.replace(output)
-        run = load_exported(output, names, outputs)
         card = {
             "format": form,
             "merl": merl.__version__,
@@ -142,6 +145,22 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
     finally:
         part.unlink(missing_ok=True)
     return card
+
+
+def _check_same(module: Deployed, run: Run, example: Values, arguments: tuple[Tensor, ...]) -> None:
+    """Check that an exported function computes what the policy computes.
+
+    Raises:
+        MerlError: it does not.
+    """
+    with torch.no_grad():
+        expected = module(*arguments)[0].numpy()
+    difference = float(np.abs(run(example)["action"] - expected).max())
+    if not difference < TOLERANCE * max(1.0, float(np.abs(expected).max())):
+        raise MerlError(
+            f"the exported policy's actions differ by {difference:.2g} from the policy's: use "
+            "another form"
+        )
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import runpy
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,7 +41,7 @@ class ExportedPolicy:
     Attributes:
         card: what the card says.
         modalities: the modality of each key that the policy uses.
-        action_size: length of an action.
+        bounds: lower and upper bounds of the actions in the environment's own units.
 
     Raises:
         MerlError: the file or its card is missing or damaged, or one is of another policy.
@@ -57,20 +58,26 @@ class ExportedPolicy:
             }
             observed = self.card["observations"].items()
             space = spaces.Dict({key: box(described) for key, described in observed})
-            (self.action_size,) = self.card["outputs"]["action"]["shape"]
+            (size,) = self.card["outputs"]["action"]["shape"]
+            if low.shape != (size,) or high.shape != (size,) or not (low < high).all():
+                raise ValueError(f"action_bounds {self.card['action_bounds']}")
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise MerlError(f"{card_of(path)} is damaged: {error!r}") from None
         self.modalities = modalities_of(space)
         self._former = {name: each for name, each in told.items() if name.endswith(FORMER)}
         self._low, self._high = low, high
+        self.bounds = low.tolist(), high.tolist()
+        self._frames: dict[str, NDArray[Any]] = {}
         try:
             self._run = load_exported(path, names, outputs)
-            self._run({name: np.zeros(shape, kind) for name, (kind, shape) in told.items()})
+            self({key: np.zeros(m.shape, m.space.dtype) for key, m in self.modalities.items()})
+            self.reset()
+        except MerlError:
+            raise
         except Exception as error:  # from ONNX Runtime or torch
             raise MerlError(
                 f"{path} cannot be run as its card says: {in_one_line(error)}: export it again"
             ) from None
-        self._frames: dict[str, NDArray[Any]] = {}
 
     def reset(self) -> None:
         """Start a new episode: discard the former frames."""
@@ -120,6 +127,8 @@ def _card(path: Path) -> dict[str, Any]:
 def load_exported(path: Path, names: list[str], outputs: list[str]) -> Run:
     """Load an exported policy; return it as a function from inputs by name to outputs by name."""
     if path.suffix == SUFFIXES["onnx"]:
+        if find_spec("onnxruntime") is None:
+            raise MerlError(f"{path} needs ONNX Runtime: pip install 'merl-rl[onnx]'")
         import onnxruntime
 
         options = onnxruntime.SessionOptions()

@@ -11,9 +11,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.core import MerlError
+from merl.core import MerlError, Observation
 from merl.core.guards import check_finite
-from merl.demos.episode import Episode, EpisodeRecording
+from merl.demos.episode import EpisodeRecording
 from merl.evaluation.evaluation import Act
 
 End = Literal["terminated", "truncated", "stopped", "time", "late"]
@@ -66,15 +66,13 @@ class Timing:
 
 @dataclass(frozen=True)
 class Driven:
-    """An episode in real time.
+    """How an episode in real time went.
 
     Attributes:
-        episode: what was observed and done; `intended` holds the actions before the limits.
         timing: times of the steps.
         end: why it ended.
     """
 
-    episode: Episode
     timing: Timing
     end: End
 
@@ -82,16 +80,16 @@ class Driven:
 def drive(
     act: Act,
     env: gymnasium.Env[Any, Any],
+    observation: Observation,
+    recording: EpisodeRecording,
     rate: float,
     limits: Limits,
     stop: Callable[[], bool],
     *,
-    reset: Callable[[], None] = lambda: None,
-    seed: int | None = None,
     sleep: Callable[[float], None] = time.sleep,
     clock: Callable[[], float] = time.perf_counter,
-) -> Driven | None:
-    """Run one episode, a step every 1 / `rate` seconds.
+) -> Driven:
+    """Run one episode after the environment's reset, a step every 1 / `rate` seconds.
 
     A step begins at its time and must end before the next one begins. After a step that is late,
     the next one begins at once and the schedule starts anew: steps are never made up for.
@@ -99,23 +97,18 @@ def drive(
     Args:
         act: maps an observation to an action in [-1, 1].
         env: the environment, whose step may return before the robot has moved.
+        observation: the observation after the reset.
+        recording: gets every step, `intended` before the limits; it keeps them after an error.
         rate: steps per second.
         limits: limits of actions, steps and lateness.
         stop: whether to stop, asked before every action.
-        reset: called after the environment's reset.
-        seed: seed of the environment's reset.
         sleep: waits, s.
         clock: returns the time, s.
-
-    Returns:
-        The episode; None if it was stopped before its first step.
 
     Raises:
         MerlError: the environment failed, or a value is not finite.
     """
-    observation, _ = env.reset(seed=seed)
-    reset()
-    recording, timing = EpisodeRecording(observation), Timing()
+    timing = Timing()
     last = np.zeros(env.action_space.shape or (), np.float32)
     period, end = 1.0 / rate, cast("End | None", None)
     begin, behind = clock(), 0
@@ -146,9 +139,7 @@ def drive(
             end = "time"
         elif behind >= limits.late:
             end = "late"
-    if not len(recording):
-        return None
-    return Driven(recording.finish(terminated=end == "terminated"), timing, end)
+    return Driven(timing, end)
 
 
 def check_rate(rate: float | None) -> float:

@@ -49,7 +49,13 @@ class Policy:
 
     def __call__(self, observation):
         """Return the action in the environment's own units, float32 (A,)."""
-        values = {{name: np.asarray(observation[name]) for name in INPUTS}}
+        values = {{}}
+        for name, (dtype, shape) in INPUTS.items():
+            value = np.asarray(observation[name])
+            if value.shape != shape or not np.can_cast(value.dtype, dtype, "same_kind"):
+                given = f"{{value.dtype}} {{value.shape}}"
+                raise ValueError(f"{{name}} is {{given}}, not {{dtype}} {{shape}}")
+            values[name] = value.astype(dtype)
         for name, frame, count in FORMER:
             copies = np.repeat(values[frame][None], count, axis=0)
             values[name] = self.frames.get(name, copies)
@@ -109,7 +115,10 @@ def cut(x, axis, begin, end):
 
 
 def _binary(sign: str) -> Callable[..., str]:
-    return lambda a, b, **_: f"{a} {sign} {b}"
+    def form(a: Any, b: Any, *, alpha: Any = 1) -> str:
+        return f"{a} {sign} {b}" if alpha == 1 else f"{a} {sign} {alpha} * {b}"
+
+    return form
 
 
 def _same(x: str, *_: Any, **__: Any) -> str:
@@ -212,12 +221,14 @@ def numpy_program(
     Raises:
         MerlError: the program has an operation without a form here.
     """
+    if not module.isidentifier():
+        raise MerlError(f"a Python file cannot be named {module}.py: give another name with --out")
     program = program.run_decompositions()
     known: dict[str, Any] = dict(_constants(program))
     weights: dict[str, Tensor] = {}
     text: dict[str, str] = {}
     lines: list[str] = []
-    shapes: dict[str, tuple[int, ...]] = {}
+    kinds: dict[str, tuple[str, tuple[int, ...]]] = {}
     inputs = iter(names)
 
     def told(value: Any) -> Any:
@@ -236,7 +247,8 @@ def numpy_program(
             if node.name not in known:
                 name = next(inputs)
                 text[node.name] = f'values["{name}"]'
-                shapes[name] = tuple(node.meta["val"].shape)
+                value = node.meta["val"]
+                kinds[name] = str(value.dtype).rpartition(".")[2], tuple(value.shape)
         elif node.op == "output":
             results = [told(each) for each in node.args[0]]
         elif all(each.name in known for each in node.all_input_nodes):
@@ -246,9 +258,9 @@ def numpy_program(
             text[node.name] = node.name
     pairs = ", ".join(f'"{name}": {value}' for name, value in zip(outputs, results, strict=True))
     body = [*lines, f"return {{{pairs}}}"]
-    plain = [name for name in names if not name.endswith("_former")]
+    plain = {name: kind for name, kind in kinds.items() if not name.endswith("_former")}
     former = [
-        (name, name.removesuffix("_former"), shapes[name][0])
+        (name, name.removesuffix("_former"), kinds[name][1][0])
         for name in names
         if name.endswith("_former")
     ]

@@ -171,16 +171,13 @@ def matched(source: Source, target: Target, rules: Rules) -> dict[str, str]:
             f"{source.path}: an action has {counted(source.action_size, 'number')}, and "
             f"{target.task} takes {target.action_space.shape[0]}"
         )
-    both = source.rate, target.rate
-    if None not in both and not rules.any_rate:
-        assert source.rate is not None
-        assert target.rate is not None
-        if abs(source.rate / target.rate - 1.0) > RATE_TOLERANCE:
-            raise MerlError(
-                f"{source.path} has {source.rate:g} steps per second, and {target.task} has "
-                f"{target.rate:g}: a step would mean another time; import them all the same with "
-                "--any-rate"
-            )
+    known = source.rate is not None and target.rate is not None
+    if known and not rules.any_rate and not _same(source.rate, target.rate):
+        raise MerlError(
+            f"{source.path} has {source.rate:g} steps per second, and {target.task} has "
+            f"{target.rate:g}: a step would mean another time; import them all the same with "
+            "--any-rate"
+        )
     return keys
 
 
@@ -298,6 +295,11 @@ def _check_feature(
     raise MerlError(f"{told}: name another with --keys {key}=FEATURE")
 
 
+def _same(one: float | None, two: float | None) -> bool:
+    """Return whether two rates are the same; NaN is none."""
+    return one is not None and two is not None and abs(one / two - 1.0) <= RATE_TOLERANCE
+
+
 def _flat(shape: tuple[int, ...]) -> tuple[int, ...]:
     """Return a shape without axes of one: () and (1,), (n,) and (n, 1) hold the same."""
     return tuple(size for size in shape if size != 1)
@@ -339,6 +341,8 @@ def _resized(frame: NDArray[np.uint8], height: int, width: int) -> NDArray[np.ui
 
 def _scaled(where: str, actions: NDArray[Any], target: Target, rules: Rules) -> NDArray[np.float32]:
     """Return actions in [-1, 1]."""
+    if actions.dtype.kind not in "biuf":
+        raise MerlError(f"{where}: actions are {actions.dtype}, not numbers")
     values = actions.astype(np.float64)
     if rules.actions == "env" and target.bounds is not None:
         low, high = (np.asarray(bound, np.float64) for bound in target.bounds)

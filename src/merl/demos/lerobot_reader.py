@@ -91,7 +91,7 @@ class LeRobotDataset:
                     f"{file} has {len(rows)} rows of {name}, and its index says {length}: copy the "
                     "dataset again"
                 )
-            part = table.slice(int(rows[0]), length)
+            part = table.take(rows)
             values = {key: self._values(part, key, file) for key in (*columns, *others)}
             for key in keys:
                 if key not in columns:

@@ -20,16 +20,9 @@ from merl.cli.parsing import parse
 from merl.core import MerlError, check_choice, counted, suggest
 from merl.core.fields import Range, check_fields
 from merl.core.statistics import bootstrap_interval
-from merl.demos.conversion import (
-    Actions,
-    Format,
-    Rules,
-    Target,
-    export_demos,
-    import_demos,
-    open_source,
-)
 from merl.demos.demonstrations import Demonstrations
+from merl.demos.exporting import Format, export_demos
+from merl.demos.importing import Actions, Rules, Target, import_demos, open_source
 from merl.demos.recorder import Recorder
 from merl.envs import make_env
 from merl.envs.config import EnvConfig, UserEnvConfig

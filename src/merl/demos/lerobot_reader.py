@@ -8,7 +8,6 @@ videos/KEY/chunk-*/file-*.mp4         frames of one camera; a file holds several
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
+from merl.demos.lerobot_frames import VideoFrames, decoded
 from merl.demos.packages import require
 from merl.demos.source import Feature, RawEpisode
 
@@ -74,7 +74,7 @@ class LeRobotDataset:
             for key in (ACTION, INTENDED, REWARD, DONE, SUCCESS, TERMINATED)
             if key in self._stored
         ]
-        videos: dict[str, _Frames] = {}
+        videos: dict[str, VideoFrames] = {}
         table, opened = None, None
         for row in self._rows:
             index, length = int(row["episode_index"]), int(row["length"])
@@ -145,7 +145,7 @@ class LeRobotDataset:
         column = table.column(key).combine_chunks()
         try:
             if kind == "image":
-                return np.stack([_decoded(each["bytes"]) for each in column.to_pylist()])
+                return np.stack([decoded(each["bytes"]) for each in column.to_pylist()])
             while hasattr(column, "flatten") and hasattr(column.type, "value_type"):
                 column = column.flatten()
             flat: NDArray[Any] = column.to_numpy(zero_copy_only=False)
@@ -155,7 +155,7 @@ class LeRobotDataset:
 
     def _frames(
         self,
-        videos: dict[str, _Frames],
+        videos: dict[str, VideoFrames],
         key: str,
         row: Mapping[str, Any],
         length: int,
@@ -164,48 +164,11 @@ class LeRobotDataset:
         """Return the frames of an episode from a video, (T, H, W, 3)."""
         file = self._file(self._patterns[1], row, f"videos/{key}", name, video_key=key)
         if key not in videos or videos[key].path != file:
-            videos[key] = _Frames(file)
+            videos[key] = VideoFrames(file)
         begin, rate = row.get(f"videos/{key}/from_timestamp"), self.rate
         if not isinstance(begin, int | float) or not np.isfinite(begin) or rate is None:
             raise MerlError(f"{self.path}: the index of {name} has no time of {key!r}")
         return np.stack([videos[key].at(begin + i / rate, 0.5 / rate) for i in range(length)])
-
-
-class _Frames:
-    """The frames of a video by their times, which are asked for in order."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._decoder = self._decode()
-        self._last: tuple[float, NDArray[np.uint8]] | None = None
-
-    def at(self, time: float, tolerance: float) -> NDArray[np.uint8]:
-        """Return the frame at a time, s.
-
-        Raises:
-            MerlError: the video cannot be read, or has no frame then.
-        """
-        try:
-            while self._last is None or self._last[0] < time - tolerance:
-                self._last = next(self._decoder)
-        except StopIteration:
-            raise MerlError(
-                f"{self.path} has no frame at {time:.3f} s: it is cut off: copy it again"
-            ) from None
-        except (av.FFmpegError, OSError, ValueError) as error:
-            raise MerlError(f"{self.path} cannot be read: {error}") from None
-        if self._last[0] > time + tolerance:
-            raise MerlError(f"{self.path} has no frame at {time:.3f} s, but at {self._last[0]:.3f}")
-        return self._last[1]
-
-    def _decode(self) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-        with av.open(str(self.path)) as container:
-            if not container.streams.video:
-                raise ValueError("it has no video")
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            for frame in container.decode(stream):
-                yield float(frame.time or 0.0), _pixels(frame)
 
 
 def _info(path: Path) -> dict[str, Any]:
@@ -247,16 +210,3 @@ def _table(file: Path, columns: list[str] | None) -> Any:
     except (OSError, pyarrow.ArrowException) as error:
         what = str(error).split("\n")[0]
         raise MerlError(f"{file} cannot be read: {what}") from None
-
-
-def _decoded(content: Any) -> NDArray[np.uint8]:
-    """Return an encoded image, such as PNG, as (H, W, 3)."""
-    if not isinstance(content, bytes):
-        raise ValueError("an image is missing")
-    with av.open(io.BytesIO(content), "r") as container:
-        return _pixels(next(container.decode(video=0)))
-
-
-def _pixels(frame: av.VideoFrame) -> NDArray[np.uint8]:
-    pixels: Any = frame.to_ndarray(format="rgb24")
-    return np.asarray(pixels, np.uint8)

@@ -6,22 +6,18 @@ after the last action: it is left out.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
-from av.video.stream import VideoStream
 from numpy.typing import NDArray
-from PIL import Image
 
 from merl.core import MerlError
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode
+from merl.demos.lerobot_frames import VideoFile, png
 from merl.demos.lerobot_reader import (
     ACTION,
     DONE,
@@ -115,7 +111,7 @@ class _Writer:
         statistics: dict[str, list[NDArray[Any]]] = {}  # of images: counts of each pixel value
         first, schema = 0, self._schema()
         tables: Any = None
-        streams: dict[str, _Video] = {}
+        streams: dict[str, VideoFile] = {}
         for index, episode in enumerate(self.demos.episodes()):
             file, chunk = index // EPISODES_PER_FILE % CHUNK, index // EPISODES_PER_FILE // CHUNK
             if index % EPISODES_PER_FILE == 0:
@@ -123,7 +119,7 @@ class _Writer:
                 path = self._path(DATA, chunk_index=chunk, file_index=file)
                 tables = parquet.ParquetWriter(path, schema, compression="snappy")
                 streams = {
-                    key: _Video(
+                    key: VideoFile(
                         self._path(
                             VIDEO, chunk_index=chunk, file_index=file, video_key=self.keys[key]
                         ),
@@ -238,7 +234,7 @@ class _Writer:
         for field in schema:
             value = values[field.name]
             if self._kind(field.name) == "image":
-                rows: list[Any] = [{"bytes": _png(frame), "path": None} for frame in value]
+                rows: list[Any] = [{"bytes": png(frame), "path": None} for frame in value]
             else:
                 shape = tuple(self.features[field.name]["shape"])
                 rows = list(value.reshape(len(value), *(() if shape == (1,) else shape)))
@@ -287,39 +283,7 @@ class _Writer:
         }
 
 
-class _Video:
-    """Writer of one MP4 file; every second frame is a key frame, so that readers can jump."""
-
-    def __init__(self, path: Path, rate: int) -> None:
-        self._rate, self._frames = rate, 0
-        self._container = av.open(str(path), "w")
-        self._stream: VideoStream | None = None
-
-    @property
-    def seconds(self) -> float:
-        """Return the length so far."""
-        return self._frames / self._rate
-
-    def add(self, image: NDArray[np.uint8]) -> None:
-        """Append a frame (H, W, 3)."""
-        if self._stream is None:
-            options = {"crf": "18", "g": "2", "bf": "0"}
-            self._stream = self._container.add_stream("libx264", self._rate, options=options)
-            self._stream.height, self._stream.width = image.shape[:2]
-            self._stream.pix_fmt = "yuv420p"
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-        frame.pts, frame.time_base = self._frames, Fraction(1, self._rate)
-        self._container.mux(self._stream.encode(frame))
-        self._frames += 1
-
-    def close(self) -> None:
-        """Finish the file."""
-        if self._stream is not None:
-            self._container.mux(self._stream.encode(None))
-        self._container.close()
-
-
-def _close(tables: Any, videos: Mapping[str, _Video]) -> None:
+def _close(tables: Any, videos: Mapping[str, VideoFile]) -> None:
     if tables is not None:
         tables.close()
     for video in videos.values():
@@ -359,9 +323,3 @@ def _statistics_of_counts(counts: NDArray[Any]) -> dict[str, float]:
     return found | {
         name: float(values[np.searchsorted(shares, share)]) for name, share in QUANTILES.items()
     }
-
-
-def _png(image: NDArray[np.uint8]) -> bytes:
-    output = io.BytesIO()
-    Image.fromarray(image).save(output, "png")
-    return output.getvalue()

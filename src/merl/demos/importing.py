@@ -1,11 +1,10 @@
-"""Import of demonstrations from the formats of other projects, with a check against an environment.
+"""Import of demonstrations from the formats of other projects, checked against an environment.
 
 Nothing is written unless every episode fits.
 """
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,13 +21,12 @@ from merl.core.user_code import in_one_line
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode, check_episode
 from merl.demos.lerobot_reader import INFO, LeRobotDataset
-from merl.demos.lerobot_writer import lerobot_name, write_lerobot
-from merl.demos.minari_data import MinariData, write_minari
+from merl.demos.lerobot_writer import lerobot_name
+from merl.demos.minari_data import MinariData
 from merl.demos.recorder import Recorder, check_free
-from merl.demos.robomimic import RobomimicFile, write_robomimic
+from merl.demos.robomimic import RobomimicFile
 from merl.demos.source import Feature, RawEpisode, Source
 
-Format = Literal["lerobot", "robomimic", "minari"]
 Actions = Literal["unit", "env"]
 RATE_TOLERANCE = 0.01
 """Relative difference of two rates that still count as equal."""
@@ -219,56 +217,6 @@ def converted(
     )
     check_episode(where, episode, target.observation_space, target.action_space)
     return episode
-
-
-def export_demos(
-    demos: Demonstrations, form: Format, out: Path, rate: float | None, *, lossless: bool = False
-) -> None:
-    """Write demonstrations in the format of another project.
-
-    Args:
-        demos: the demonstrations.
-        form: the format.
-        out: the folder, or robomimic's file; it must not exist.
-        rate: timesteps in a second.
-        lossless: store images without loss in LeRobot's format too.
-
-    Raises:
-        MerlError: they do not fit the format, or cannot be read or written; nothing is written.
-    """
-    if not demos.lines:
-        raise MerlError(f"{demos.path} holds no episode")
-    out = out.absolute()
-    if out.exists():
-        raise MerlError(f"{out} exists: name another with --out")
-    if form == "lerobot" and rate is None:
-        raise MerlError("LeRobotDataset needs the steps per second: give them with --rate")
-    part = out.with_name(f".{out.name}.part")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        _remove(part)
-        if form != "robomimic":
-            part.mkdir()
-        if form == "lerobot":
-            assert rate is not None
-            write_lerobot(demos, part, rate, lossless=lossless)
-        elif form == "minari":
-            write_minari(demos, part)
-        else:
-            write_robomimic(demos, part, rate)
-        part.replace(out)
-    except OSError as error:
-        raise MerlError(f"{out} cannot be written: {error.strerror or error}") from None
-    finally:
-        _remove(part)
-
-
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
 
 
 def _name_of(key: str, source: Source) -> str:

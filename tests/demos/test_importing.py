@@ -16,9 +16,10 @@ from gymnasium import spaces
 from pyarrow import parquet
 
 from merl.core import MerlError
-from merl.demos.conversion import Format, Rules, Target, export_demos, import_demos, open_source
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode
+from merl.demos.exporting import Format, export_demos
+from merl.demos.importing import Rules, Target, import_demos, open_source
 from merl.demos.recorder import Recorder
 
 OBSERVATION = spaces.Dict(

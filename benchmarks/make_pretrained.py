@@ -19,8 +19,8 @@ from safetensors.torch import load_file, save_file
 
 import merl
 from merl.core.statistics import Interval
-from merl.runs.checkpoint import Checkpoint
 from merl.demos.demonstrations import Demonstrations
+from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
 from merl.runs.run_folder import PRETRAINED
 

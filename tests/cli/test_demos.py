@@ -187,7 +187,8 @@ def test_an_exported_dataset_is_imported_and_learnt_from(
     assert main([*given, "--leave-out", "state", "--out", str(back)]) == 0
     shown = flat(capsys.readouterr().out)
     assert "the source compressed observation.images.image with loss" in shown
-    assert f"merl train reach_duplo --preset smoke --replay.demos {back}" in shown
+    line = f"merl train reach_duplo --preset smoke --agent.keys image proprio --replay.demos {back}"
+    assert line in shown
     assert list(Demonstrations.open(back).observation_space) == ["image", "proprio"]
     train = ["train", "reach_duplo", *TINY, "--steps", "60", "--run-dir", str(tmp_path / "run")]
     assert main([*train, "--eval.every", "0", "--replay.demos", str(back)]) == 0

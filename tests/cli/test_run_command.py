@@ -9,7 +9,6 @@ import pty
 import subprocess
 import sys
 import termios
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ import pytest
 
 from helpers import flat
 from merl.cli import main
+from merl.cli.run import Stop
 from merl.demos.demonstrations import Demonstrations
 
 POLICY = "pretrained/reach_duplo"
@@ -39,7 +39,8 @@ def blind():
 
 class Slow(gymnasium.Wrapper):
     def reset(self, **options):
-        time.sleep(60)  # waits for a person
+        print("WAITING", flush=True)
+        time.sleep(60)  # for a person; the signal ends it
 
     def close(self):
         print("CLOSED", flush=True)
@@ -140,8 +141,8 @@ def test_late_steps_end_the_run(robot: str, capsys: pytest.CaptureFixture[str]) 
     assert "stopped: 5 steps in a row missed the deadline" in flat(capsys.readouterr().out)
 
 
-def in_terminal(command: list[str], sends: list[bytes], folder: Path) -> tuple[int, str, bool]:
-    """Run a command in a terminal, and send keys after the first line that says how to stop.
+def in_terminal(command: list[str], after: str, keys: bytes, folder: Path) -> tuple[int, str, bool]:
+    """Run a command in a terminal, and send keys after a line with these words.
 
     Returns:
         Its exit code, its output, and whether the terminal is afterwards as before.
@@ -158,18 +159,18 @@ def in_terminal(command: list[str], sends: list[bytes], folder: Path) -> tuple[i
         preexec_fn=lambda: fcntl.ioctl(theirs, termios.TIOCSCTTY, 0),
     ) as process:
         assert process.stdout is not None
-        shown = process.stdout.readline()
-        assert "Space or Ctrl-C stops" in shown
-        for keys in sends:
-            time.sleep(1.0)
-            os.write(ours, keys)
+        shown = line = process.stdout.readline()
+        while line and after not in line:
+            shown += (line := process.stdout.readline())
+        os.write(ours, keys)
         out, _ = process.communicate(timeout=60)
     return process.returncode, shown + out, termios.tcgetattr(theirs) == before
 
 
 @pytest.mark.parametrize("keys", [b" ", b"xq", b"\x1b"])
 def test_a_key_stops_it(keys: bytes, tmp_path: Path) -> None:
-    code, out, restored = in_terminal([POLICY, "--hz", "20", "--episodes", "3"], [keys], tmp_path)
+    command = [POLICY, "--hz", "20", "--episodes", "3"]
+    code, out, restored = in_terminal(command, "Space or Ctrl-C stops", keys, tmp_path)
     assert code == 0
     assert "stopped" in out
     assert "episode 2" not in out
@@ -179,7 +180,7 @@ def test_a_key_stops_it(keys: bytes, tmp_path: Path) -> None:
 def test_a_signal_ends_a_reset_that_waits(robot: str, tmp_path: Path) -> None:
     """The environment is closed, and the terminal is as before."""
     command = [POLICY, "--env", f"{robot}:slow", "--hz", "20"]
-    code, out, restored = in_terminal(command, [b"\x03"], tmp_path)
+    code, out, restored = in_terminal(command, "WAITING", b"\x03", tmp_path)
     assert code == 128 + 2
     assert "CLOSED" in out
     assert restored
@@ -196,3 +197,11 @@ def test_actions_in_other_units_are_refused(robot: str, capsys: pytest.CaptureFi
     assert main(["run", POLICY, "--env", f"{robot}:strong", "--log", "log"]) != 0
     assert "an action would be another movement" in flat(capsys.readouterr().err)
     assert not Path("log").exists()
+
+
+def test_a_stop_before_the_first_reset_moves_nothing(
+    robot: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Stop, "asked", lambda self: True)
+    assert main(["run", POLICY, "--env", f"{robot}:failing"]) == 0
+    assert "stopped before the first step" in flat(capsys.readouterr().out)

@@ -94,7 +94,7 @@ def run(args: list[str]) -> int:
         policy(env.observation_space.sample())  # the first call takes longer
         stop = stack.enter_context(Stop.listening())
         _tell(console, f"{options.run} in {name}, {rate:g} steps per second: {stop.keys} stops")
-        code = 0
+        code = acted = 0
         for index in range(options.episodes):
             if stop.asked():
                 break
@@ -108,6 +108,7 @@ def run(args: list[str]) -> int:
             finally:  # also after an error, whose episode is the most interesting
                 if recorder is not None and len(recording):
                     recorder.add(recording.finish(terminated=terminated))
+            acted += len(recording)
             if len(recording):
                 episode = recording.finish(terminated=terminated)
                 _tell(console, f"episode {index + 1}: {_told(episode, found)}")
@@ -116,7 +117,7 @@ def run(args: list[str]) -> int:
                 _tell(console, f"stopped: {message}: use a lower --hz")
                 code = 1
                 break
-        if not len(recording):
+        if not acted:
             _tell(console, "stopped before the first step")
         if recorder is not None and recorder.demonstrations.lines:
             _tell(console, f"log: {log}")

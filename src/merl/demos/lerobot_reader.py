@@ -45,7 +45,6 @@ class LeRobotDataset:
         require("pyarrow", "LeRobotDataset")
         info = _info(path)
         try:
-            self._info = info
             self.rate: float | None = float(info["fps"])
             if not 0 < self.rate < float("inf"):
                 raise ValueError(f"fps {self.rate}")
@@ -70,9 +69,7 @@ class LeRobotDataset:
         """Read the episodes with these features; see `Source`."""
         columns = [key for key in keys if self._stored[key][0] != "video"]
         others = [
-            key
-            for key in (ACTION, INTENDED, REWARD, DONE, SUCCESS, TERMINATED)
-            if key in self._stored
+            key for key in (ACTION, INTENDED, REWARD, SUCCESS, TERMINATED) if key in self._stored
         ]
         videos: dict[str, VideoFrames] = {}
         table, opened = None, None

@@ -23,6 +23,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 ALLOWED_SKIPS = (
     r"no OpenGL library works on this machine",
     r"this machine has CUDA",
+    r"this machine has no CUDA device",
     r"no Chromium on this machine",
     r"timm is not installed",
     r"this system does not allow users to mount a disk",

@@ -1,4 +1,4 @@
-"""The copy on the device gives the same samples as the replay; here the device is the CPU."""
+"""The copy on the device gives the same samples as the replay; without a GPU it is on the CPU."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from merl.accelerate.device_replay import CHUNK, DeviceReplay, bytes_on_device
 from merl.core import Batch
 from merl.replay import ReplayBuffer
 
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 EPISODES = st.builds(Episode, st.integers(1, 9), st.sampled_from(["end", "limit", "cut"]))
 
 
@@ -51,11 +52,11 @@ def check(copy: DeviceReplay, replay: ReplayBuffer) -> None:
     for number, ring in enumerate(replay.rings):
         if not len(ring):
             continue
-        steps = torch.arange(ring.first, ring.steps)
+        steps = torch.arange(ring.first, ring.steps, device=DEVICE)
         found = copy.at(torch.full_like(steps, number), steps)
         expected = tensors(replay.sample(1, EveryOfOne(number)))  # type: ignore[arg-type]
         for name, value in tensors(found).items():
-            assert torch.equal(value, expected[name]), name
+            assert torch.equal(value.cpu(), expected[name]), name
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=list(HealthCheck))
@@ -66,7 +67,7 @@ def test_copy_gives_the_same_samples_as_the_rings(
     stack, n_step = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 4))
     small = config(capacity=20 * len(plans), frame_stack=stack, n_step=n_step)
     replay = ReplayBuffer(spec_of(small, rings=len(plans)))
-    copy = DeviceReplay(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, DEVICE)
     writers = [writing(replay, number, plan) for number, plan in enumerate(plans)]
     every = data.draw(st.integers(1, 40))
     timestep = 0
@@ -86,7 +87,7 @@ def test_many_new_slots_are_copied_in_chunks() -> None:
     replay = make(capacity=3 * CHUNK)
     for _ in writing(replay, 0, [Episode(50, "limit")] * 300):
         pass
-    copy = DeviceReplay(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, DEVICE)
     copy.follow()
     check(copy, replay)
     assert bytes_on_device(replay) > 3 * CHUNK * 36
@@ -97,10 +98,10 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
     for number, lengths in enumerate(([7, 40], [5])):
         for _ in writing(replay, number, [Episode(length, "limit") for length in lengths]):
             pass
-    copy = DeviceReplay(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, DEVICE)
     copy.follow()
     count = 25 * 2000
-    batch = copy.sample(count, torch.Generator().manual_seed(0))
+    batch = copy.sample(count, torch.Generator(DEVICE).manual_seed(0))
     drawn, often = batch.action.unique(dim=0, return_counts=True)
     held = [
         tuple(row)
@@ -116,7 +117,7 @@ def test_every_step_of_every_ring_is_drawn_equally_often() -> None:
 def test_uninitialised_memory_does_not_reach_a_batch() -> None:
     """The copy's memory on a GPU is not initialised, and may hold NaN."""
     replay = make(capacity=50)
-    copy = DeviceReplay(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, DEVICE)
     for field in copy._fields.values():
         if field.is_floating_point():
             field.fill_(torch.nan)
@@ -149,7 +150,7 @@ def test_rings_after_growth(tmp_path: Path) -> None:
             pass
     replay = ReplayBuffer(replace(spec, capacity=60), tmp_path)
     replay.load_state_dict(shorter.state_dict())
-    copy = DeviceReplay(replay, torch.device("cpu"))
+    copy = DeviceReplay(replay, DEVICE)
     for episode in range(6):
         copy.follow()
         check(copy, replay)

@@ -27,6 +27,7 @@ COMPARED = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", 
 def main() -> None:
     """Draw all figures; print the table of the evaluations."""
     laptop()
+    gpu()
     agents()
     small_tasks()
     boxes()
@@ -57,6 +58,28 @@ def laptop() -> None:
         IMAGES / "laptop.png",
         x="minutes",
         references=lines,
+        title="reach_duplo",
+    )
+
+
+def gpu() -> None:
+    """Draw preset paper on a GPU beside DrQ-v2's published curve."""
+    published = {}
+    with (DATA / "gpu/drqv2_published.csv").open() as file:
+        for row in csv.DictReader(file):
+            points = published.setdefault(row["seed"], [])
+            points.append((float(row["frame"]), float(row["return"])))
+    lines = {row.name: row.returns.mean for row in references("reach_duplo")}
+    learning_curves(
+        {
+            "MERL, preset paper, one seed": [
+                DATA / "gpu/reach_duplo-merl-paper-h100-raster-s0.csv"
+            ],
+            "DrQ-v2, published": [Curve(*np.array(points).T) for points in published.values()],
+        },
+        IMAGES / "gpu.png",
+        band="bootstrap",
+        references={"scripted expert": lines["scripted expert"]},
         title="reach_duplo",
     )
 

@@ -213,7 +213,7 @@ class Disturbing(DotEnv):
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two runs: with an environment that changes torch's settings, and with one that does not."""
-    flags = ["--preset", "smoke", "--threads", "1", "--agent.precision", "fp32"]
+    flags = ["--preset", "smoke", "--threads", "1", "--agent.precision", "fp32", "--device", "cpu"]
     flags += ["--steps", "40", "--random-steps", "20", "--seed-steps", "20"]
     flags += ["--replay.batch-size", "8", "--eval.every", "30", "--eval.episodes", "1"]
     flags += ["--eval.video", "none", "--agent.hidden-dim", "8", "--agent.latent-dim", "8"]

@@ -1,5 +1,8 @@
 """`ReachDuplo` compared with dm_control's `reach_duplo`."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from dm_control import manipulation
@@ -106,3 +109,10 @@ def test_a_wrong_simulator_version_is_rejected_in_one_line(monkeypatch):
     monkeypatch.setattr(simulator, "version", lambda _: "4.0.0")
     with pytest.raises(MerlError, match=r"merl needs mujoco 3\.17\.0, found 4\.0\.0: pip install"):
         simulator.check_versions()
+
+
+def test_importing_the_tasks_leaves_python_s_warnings_as_they_were():
+    """dm_control lets Python show every deprecation, in every package."""
+    shown = "[w for w in warnings.filters if (w[0], w[2]) == ('always', DeprecationWarning)]"
+    code = f"import warnings, merl.tasks; assert not {shown}"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -69,7 +70,11 @@ def quiet_inverse_kinematics() -> Iterator[None]:
 
 
 check_versions()
-with environment(MUJOCO_GL="disabled", DISABLE_RENDER_THREAD_OFFLOADING="1"):
+with (
+    environment(MUJOCO_GL="disabled", DISABLE_RENDER_THREAD_OFFLOADING="1"),
+    warnings.catch_warnings(),  # dm_control.composer lets Python show every deprecation
+):
     importlib.import_module("mujoco")
     # Render in the calling thread: dm_control's render thread fails if Python exits first.
     importlib.import_module("dm_control._render.executor")
+    importlib.import_module("dm_control.composer")

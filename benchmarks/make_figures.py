@@ -64,7 +64,7 @@ def laptop() -> None:
 
 def gpu() -> None:
     """Draw preset paper on a GPU beside DrQ-v2's published curve."""
-    published = {}
+    published: dict[str, list[tuple[float, float]]] = {}
     with (DATA / "gpu/drqv2_published.csv").open() as file:
         for row in csv.DictReader(file):
             points = published.setdefault(row["seed"], [])

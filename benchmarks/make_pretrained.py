@@ -33,7 +33,7 @@ def write_policy(run: Run, checkpoint: Checkpoint, folder: Path) -> None:
     """Write the parts of a run that `load_policy` reads."""
     record = json.loads((run.path / "config.json").read_text())
     record["config"]["run_dir"] = None
-    record["config"]["replay"]["demos"] = None  # a path of its machine; the digest stays
+    record["config"]["demos"] = None  # a path of its machine; the digest stays
     record["id"] = uuid.uuid4().hex  # the run's own id is a secret of its machine
     record.pop("resumed", None)
     at = folder / "checkpoints" / checkpoint.path.name
@@ -67,7 +67,7 @@ def fingerprint(path: Path) -> dict[str, object]:
 def write_card(run: Run, step: int, name: str, commit: str | None) -> None:
     """Evaluate the policy and write its card."""
     record = json.loads((run.path / "config.json").read_text())
-    demos = run.config.replay.demos
+    demos = run.config.demos
     shown_by = "none" if demos is None else told(Demonstrations.open(demos))
     result = merl.load_policy(f"pretrained/{name}").evaluate(episodes=EPISODES)
     success = result.success_end

@@ -17,6 +17,7 @@ from merl.core import MerlError
 from merl.envs.user_env import MakeEnv, task_of
 from merl.evaluation.evaluation import Evaluation
 from merl.evaluation.policy import load_policy
+from merl.experiments.cloning import clone_first
 from merl.experiments.presets import compose, default_preset
 from merl.rendering.config import RendererName
 from merl.runs.resume import resume_request
@@ -56,7 +57,7 @@ def train(
             preset's. Ignored if `task` is a config.
         setting: `matched` (MERL's values) or `published` (those of the agent's authors). Ignored if
             `task` is a config.
-        callbacks: called while it trains.
+        callbacks: called while it trains; not while `demos_pretrain` clones before.
         progress: whether to show a progress bar, in a terminal or a notebook; in other output,
             lines.
         overrides: values of `TrainConfig` by name, nested ones by their dotted name, as on the
@@ -84,7 +85,17 @@ def train(
         task = compose(source.preset, task or name, agent, setting)
     if overrides.get("run_dir") is not None:
         overrides["run_dir"] = Path(overrides["run_dir"])
-    return _fit(override(task, overrides), callbacks, progress, make=make, source=source)
+    first_part = clone_first(
+        override(task, overrides),
+        source,
+        lambda first: _fit(first, (), progress, make=make, source=source),
+        lambda run, first: _resume(run, first, (), progress, make, trusted=False),
+        Outcome.was_stopped,
+    )
+    config, stopped = first_part
+    if stopped is not None:
+        return stopped
+    return _fit(config, callbacks, progress, make=make, source=source)
 
 
 def resume(
@@ -119,12 +130,7 @@ def resume(
     """
     opened = Run.open(Path(run)).with_agent(trusted=trust)
     asked = resume_request(opened.config, steps, minutes, device)
-    imports = env is None
-    with resumption(opened, asked, ["device"], imports=imports, trusted=trust) as found:
-        if found.done is not None:
-            return found.done
-        resumed = found.run, found.start
-        return _fit(found.config, callbacks, progress, make=env, resumed=resumed)
+    return _resume(opened, asked, callbacks, progress, env, trusted=trust)
 
 
 def evaluate(
@@ -163,6 +169,24 @@ def evaluate(
         max_episode_steps=max_episode_steps,
         trust=trust,
     )
+
+
+def _resume(
+    run: Run,
+    asked: TrainConfig,
+    callbacks: Iterable[Callback],
+    progress: bool,
+    make: MakeEnv | None,
+    *,
+    trusted: bool,
+) -> Outcome:
+    """Resume a run with a config; return the outcome of a run that has ended as it is."""
+    imports = make is None
+    with resumption(run, asked, ["device"], imports=imports, trusted=trusted) as found:
+        if found.done is not None:
+            return found.done
+        resumed = found.run, found.start
+        return _fit(found.config, callbacks, progress, make=make, resumed=resumed)
 
 
 def _fit(

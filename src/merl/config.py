@@ -124,6 +124,15 @@ class TrainConfig:
     package)."""
     keep: Steps = 2
     """Number of recent checkpoints to keep, in addition to the best one."""
+    demos: Path | None = None
+    """Folder of demonstrations (`merl demos`), from which a part of each batch is drawn."""
+    demos_ratio: Annotated[float, Range(0, 1, without=0)] = 0.5
+    """Share of the demonstrations in each batch, in (0, 1]."""
+    demos_pretrain: NotNegative = 0
+    """Updates of agent `bc` from the demonstrations before the run, in a run of its own, RUN-bc,
+    whose policy the agent starts with (`agent.start-from`)."""
+    demos_hash: tyro.conf.Suppress[str | None] = None
+    """Digest of the demonstrations; recorded when the run starts, checked when it resumes."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(
         default_factory=lambda: EnvConfig(renderer="gl")
     )

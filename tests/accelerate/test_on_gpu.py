@@ -133,7 +133,7 @@ def test_a_run_learns_from_demonstrations(tmp_path: Path) -> None:
     record = ["demos", "record", "reach_duplo", "--preset", "smoke", "--episodes", "2"]
     assert main([*record, "--out", demos]) == 0
     cloning: dict[str, Any] = {
-        "replay.demos": demos,
+        "demos": demos,
         "agent.clone_weight": 0.5,
         "agent.clone_steps": 400,
     }

@@ -56,7 +56,7 @@ def test_cloning_moves_no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     )
     for episode in record_episodes(lambda _: np.ones(1), env, 2, failures=True):
         recorder.add(episode)
-    run = ["train", "still_robot:make_env", "--agent", "bc", "--replay.demos", "demos"]
+    run = ["train", "still_robot:make_env", "--agent", "bc", "--demos", "demos"]
     run += ["--eval.every", "0", "--steps", "600", "--run-dir", "run", "--threads", "1"]
     assert main([*run, "--replay.batch-size", "8"]) == 0
     with (tmp_path / "run" / "metrics.csv").open() as file:

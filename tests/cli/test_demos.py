@@ -56,7 +56,7 @@ def test_recorded_episodes_are_successes_with_noise(
 def test_a_run_learns_from_demonstrations_and_resumes_exactly(
     agent: str, demos: Path, tmp_path: Path
 ) -> None:
-    train = ["train", "reach_duplo", "--agent", agent, *TINY, "--replay.demos", str(demos)]
+    train = ["train", "reach_duplo", "--agent", agent, *TINY, "--demos", str(demos)]
     clone = [] if agent == "bc" else ["--agent.clone-weight", "0.5", "--agent.clone-steps", "400"]
     clone += [] if agent == "bc" else ["--agent.clone-better"]
     runs = {name: tmp_path / name for name in ("whole", "halves", "without")}
@@ -67,7 +67,7 @@ def test_a_run_learns_from_demonstrations_and_resumes_exactly(
     whole, halves = weights(runs["whole"]), weights(runs["halves"])
     for name, value in whole.items():
         torch.testing.assert_close(halves[name], value, rtol=0, atol=0)
-    config = json.loads((runs["whole"] / "config.json").read_text())["config"]["replay"]
+    config = json.loads((runs["whole"] / "config.json").read_text())["config"]
     assert config["demos"] == str(demos)
     assert config["demos_hash"] == Demonstrations.open(demos).digest()
     assert config["demos_ratio"] == (1.0 if agent == "bc" else 0.5)
@@ -83,13 +83,13 @@ def test_other_demonstrations_are_refused_on_resume(
 ) -> None:
     copy, run = tmp_path / "copy", tmp_path / "run"
     shutil.copytree(demos, copy)
-    train = ["train", "reach_duplo", *TINY, "--replay.demos", str(copy), "--run-dir", str(run)]
+    train = ["train", "reach_duplo", *TINY, "--demos", str(copy), "--run-dir", str(run)]
     assert main([*train, "--steps", "250"]) == 0
     moved = tmp_path / "moved"
     copy.rename(moved)
     assert main(["resume", str(run), "--steps", "300"]) == 2
     assert "copy holds no demonstrations" in capsys.readouterr().err
-    again = ["train", "reach_duplo", *TINY, "--replay.demos", str(moved), "--run-dir", str(run)]
+    again = ["train", "reach_duplo", *TINY, "--demos", str(moved), "--run-dir", str(run)]
     assert main([*again, "--steps", "300", "--resume"]) == 0
     file = moved / "00000.npz"
     file.write_bytes(file.read_bytes() + b" ")
@@ -101,7 +101,7 @@ def test_other_demonstrations_are_refused_on_resume(
 def test_demonstrations_of_another_task_or_reward_are_refused(
     demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train = ["train", *TINY, "--run-dir", str(tmp_path / "run"), "--replay.demos"]
+    train = ["train", *TINY, "--run-dir", str(tmp_path / "run"), "--demos"]
     assert main([*train, str(demos), "move_box"]) == 2
     assert "holds demonstrations of reach_duplo, not of move_box" in capsys.readouterr().err
     index = json.loads((demos / "demos.json").read_text())
@@ -151,12 +151,12 @@ def test_a_policy_can_demonstrate(tmp_path: Path) -> None:
             "agent.clone-better is an option of the cloning term",
         ),
         (
-            ["train", "reach_duplo", *TINY, "--replay.demos", "nowhere"],
+            ["train", "reach_duplo", *TINY, "--demos", "nowhere"],
             "nowhere holds no demonstrations",
         ),
         (
-            ["train", "reach_duplo", *TINY, "--replay.demos-ratio", "1.5"],
-            "replay.demos-ratio must be above 0 and at most 1",
+            ["train", "reach_duplo", *TINY, "--demos-ratio", "1.5"],
+            "demos-ratio must be above 0 and at most 1",
         ),
     ],
 )
@@ -187,11 +187,11 @@ def test_an_exported_dataset_is_imported_and_learnt_from(
     assert main([*given, "--leave-out", "state", "--out", str(back)]) == 0
     shown = flat(capsys.readouterr().out)
     assert "the source compressed observation.images.image with loss" in shown
-    line = f"merl train reach_duplo --preset smoke --agent.keys image proprio --replay.demos {back}"
+    line = f"merl train reach_duplo --preset smoke --agent.keys image proprio --demos {back}"
     assert line in shown
     assert list(Demonstrations.open(back).observation_space) == ["image", "proprio"]
     train = ["train", "reach_duplo", *TINY, "--steps", "60", "--run-dir", str(tmp_path / "run")]
-    assert main([*train, "--eval.every", "0", "--replay.demos", str(back)]) == 0
+    assert main([*train, "--eval.every", "0", "--demos", str(back)]) == 0
     capsys.readouterr()
     assert main([*given, "--image-size", "24", "--out", str(tmp_path / "other")]) != 0
     assert "resize its images with --resize" in flat(capsys.readouterr().err)

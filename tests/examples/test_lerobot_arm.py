@@ -124,6 +124,6 @@ def test_the_whole_way_runs(
     assert Demonstrations.open(tmp_path / "log").steps == 20
     index = tmp_path / "log" / "demos.json"
     index.write_text(index.read_text().replace("make_unpaced", "make_env"))
-    assert main([*train, "--agent", "bc", "--replay.demos", "log", "--run-dir", "cloned"]) == 0
-    start = ["--agent.start-from", "cloned", "--replay.demos", "log", "--run-dir", "second"]
+    assert main([*train, "--agent", "bc", "--demos", "log", "--run-dir", "cloned"]) == 0
+    start = ["--agent.start-from", "cloned", "--demos", "log", "--run-dir", "second"]
     assert main([*train, *start]) == 0

@@ -107,7 +107,7 @@ class AgentConfig(ObservationConfig):
     noise_clip: NotNegative = 0.3
     """Bound of the noise in the updates of critic and actor; when acting, noise is not clipped."""
     clone_weight: NotNegative = 0.0
-    """Weight of a term in the actor's loss that clones the demonstrations (`--replay.demos`): the
+    """Weight of a term in the actor's loss that clones the demonstrations (`--demos`): the
     squared error of its actions, in units of the mean absolute value of the critic."""
     clone_better: bool = False
     """Clone the run's own actions too, where the critic rates them above the actor's (Q-filter).

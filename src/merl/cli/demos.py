@@ -337,5 +337,5 @@ def _tell_line(console: Console, options: Any, preset: str, keys: tuple[str, ...
             if value != before:
                 given += flags(f"env.{each.name}", value)
     line = ["merl", "train", options.task, "--preset", preset, *given]
-    line += ["--replay.demos", str(options.folder)]
+    line += ["--demos", str(options.folder)]
     console.print(f"learn from them: {shlex.join(line)}", highlight=False, soft_wrap=True)

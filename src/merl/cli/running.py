@@ -16,6 +16,7 @@ from merl.cli.output import make_console
 from merl.cli.summary import summarize
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import counted
+from merl.experiments.cloning import clone_first
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
@@ -30,14 +31,18 @@ DAY = 86_400.0  # seconds
 
 
 def begin(config: TrainConfig, source: Source, what: str) -> int:
-    """Train a new run to its end; return the exit code.
+    """Train a new run to its end, after a run that clones if asked; return the exit code.
 
     Args:
         config: the config of the run.
         source: where its values come from.
         what: a description of the run, for the first printed line.
     """
-    return _train(config, what, source=source)
+    cloning = f"{what}, which begins with a run that clones the demonstrations"
+    then, stopped = clone_first(
+        config, source, lambda first: _train(first, cloning, source=source), go_on, bool
+    )
+    return _train(then, what, source=source) if stopped is None else stopped
 
 
 def go_on(

@@ -16,6 +16,7 @@ from merl.cli.parsing import parse
 from merl.cli.running import begin, go_on
 from merl.config import Setting, Source, TrainConfig, flat
 from merl.core import CONFIG_FILE, MerlError
+from merl.experiments.cloning import starts_cloned
 from merl.experiments.presets import PRESETS, compose, default_preset
 from merl.runs.resume import decided, left_open
 from merl.runs.run import Run
@@ -29,7 +30,8 @@ class Choice:
 
     preset: Annotated[str | None, tyro.conf.arg(metavar="|".join(PRESETS))] = None
     """Set of default values for the other options: paper (Table 1, for a machine with CUDA), laptop
-    (2 cores without a GPU), state (from the simulator's state) or smoke (a test in a minute)."""
+    (2 cores without a GPU), demos (from demonstrations first), state (from the simulator's state)
+    or smoke (a test in a minute)."""
     agent: Annotated[str | None, tyro.conf.arg(metavar="|".join([*AGENTS, "MODULE:CLASS"]))] = None
     """Agent and the observations that it uses. merl: camera and joints; drqv2: camera; proprio:
     joints; merl_state, ddpg, sac: state; module:Class: your own."""
@@ -57,7 +59,7 @@ class _First(Choice):
 
 
 def train(args: list[str]) -> int:
-    """Train an agent: merl train TASK [--preset paper|laptop|state|smoke] [--steps N] ..."""
+    """Train an agent: merl train TASK [--preset paper|laptop|demos|state|smoke] [--steps N] ..."""
     rest: list[str] = []
     first = parse(_First, PROG, args, rest=rest)
     preset = default_preset() if first.preset is None else first.preset
@@ -85,7 +87,8 @@ def train(args: list[str]) -> int:
             run = Run.open(config.run_dir)
             if run.config.agent_name == config.agent_name:  # otherwise `go_on` refuses
                 run = run.with_agent(named_in=Path.cwd())
-            return go_on(run, config, given_open, named_in=Path.cwd())
+            asked = starts_cloned(config, run)
+            return go_on(run, asked, given_open, named_in=Path.cwd())
     why = "CUDA is available" if preset == "paper" else "CUDA is not available"
     reason = why if first.preset is None else "as requested"
     return begin(config, source, f"preset {preset} ({reason}; {PRESETS[preset].about})")

@@ -55,7 +55,7 @@ HARMLESS = (
     "eval.max_episode_steps",
     "eval.video",
     "eval.references",
-    "replay.demos",
+    "demos",
     "agent.precision",
     "agent.torch_compile",
 )

@@ -43,43 +43,67 @@ class Preset:
     for_user_env: Mapping[str, Any] = field(default_factory=dict)
 
 
+_LAPTOP = Preset(
+    "made for 2 cores without a GPU: learns in half an hour",  # docs/explanation/laptop.md
+    TrainConfig(
+        _TASK,
+        steps=1_000_000,
+        random_steps=20_000,
+        seed_steps=20_000,
+        updates_per_step=0.25,
+        num_envs=4,
+        synchronous=False,
+        env=EnvConfig(renderer="raster", image_size=24, samples=3),
+        replay=ReplayConfig(batch_size=128, frame_stack=2),
+        eval=EvaluationConfig(every=40_000, episodes=10, video="last"),
+    ),
+    {
+        "learning_rate": 3e-4,
+        "conv_strides": (2, 2, 1),
+        "shift_pad": 1,
+        "hidden_dim": 256,
+        "actor_average": 0.001,
+        "learning_rate_end": 1e-4,
+        "learning_rate_steps": 400_000,
+    },
+    for_user_env={
+        "steps": 150_000,
+        "random_steps": 1000,
+        "seed_steps": 2000,
+        "updates_per_step": 1.0,
+        "num_envs": 1,
+        "synchronous": True,
+    },
+)
+_DEMOS = Preset(
+    "learns from demonstrations (--demos), then from its own experience too, on one core",
+    dataclasses.replace(
+        _LAPTOP.config,
+        steps=500_000,
+        random_steps=0,
+        seed_steps=1000,
+        num_envs=1,
+        synchronous=True,
+        demos_ratio=0.25,
+        demos_pretrain=30_000,
+        env=dataclasses.replace(
+            _LAPTOP.config.env,
+            observations=("image", "wrist", "proprio", "touch"),
+            reward="staged",
+        ),
+        eval=EvaluationConfig(every=40_000, episodes=50, video="last"),
+    ),
+    {**_LAPTOP.agent, "clone_weight": 1.5, "clone_better": True, "noise_std": 0.1},
+    for_user_env={"steps": 100_000, "demos_pretrain": 10_000, "updates_per_step": 1.0},
+)
+
 PRESETS: dict[str, Preset] = {
     "paper": Preset(
         "Table 1, OpenGL images: for a machine with CUDA",
         TrainConfig(_TASK, env=EnvConfig(renderer="gl")),
     ),
-    "laptop": Preset(
-        "made for 2 cores without a GPU: learns in half an hour",  # docs/explanation/laptop.md
-        TrainConfig(
-            _TASK,
-            steps=1_000_000,
-            random_steps=20_000,
-            seed_steps=20_000,
-            updates_per_step=0.25,
-            num_envs=4,
-            synchronous=False,
-            env=EnvConfig(renderer="raster", image_size=24, samples=3),
-            replay=ReplayConfig(batch_size=128, frame_stack=2),
-            eval=EvaluationConfig(every=40_000, episodes=10, video="last"),
-        ),
-        {
-            "learning_rate": 3e-4,
-            "conv_strides": (2, 2, 1),
-            "shift_pad": 1,
-            "hidden_dim": 256,
-            "actor_average": 0.001,
-            "learning_rate_end": 1e-4,
-            "learning_rate_steps": 400_000,
-        },
-        for_user_env={
-            "steps": 150_000,
-            "random_steps": 1000,
-            "seed_steps": 2000,
-            "updates_per_step": 1.0,
-            "num_envs": 1,
-            "synchronous": True,
-        },
-    ),
+    "laptop": _LAPTOP,
+    "demos": _DEMOS,
     "state": Preset(
         "learns from the simulator's state in place of camera and joints, on one core",
         TrainConfig(
@@ -119,7 +143,8 @@ HEAD_LAYERS = {"move_box": 6, "lift_box": 6}
 
 
 IMITATING = {
-    "replay.demos_ratio": 1.0,
+    "demos_ratio": 1.0,
+    "demos_pretrain": 0,
     "num_envs": 1,
     "synchronous": True,
     "updates_per_step": 1.0,

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
-
-import tyro
 
 from merl.core import MerlError, counted
 from merl.core.fields import Range, check_fields
@@ -26,12 +23,6 @@ class ReplayConfig:
     """Number of consecutive images in one observation."""
     discount: Annotated[float, Range(0, 1)] = 0.99
     """Discount factor per step (gamma), from 0 to 1."""
-    demos: Path | None = None
-    """Folder of demonstrations (`merl demos`), from which a part of each batch is drawn."""
-    demos_ratio: Annotated[float, Range(0, 1, without=0)] = 0.5
-    """Share of the demonstrations in each batch, in (0, 1]."""
-    demos_hash: tyro.conf.Suppress[str | None] = None
-    """Digest of the demonstrations; recorded when the run starts, checked when it resumes."""
     compress: bool = False
     """Compress images without loss to about a quarter of the space; sampling takes longer. Noisy
     images of a real camera need more space, so that the replay holds fewer steps."""

@@ -16,7 +16,7 @@ _LEFT_OPEN = {
     "agent.torch_compile": "auto",
     "agent.keys": None,
     "agent.critic_high": None,
-    "replay.demos_hash": None,
+    "demos_hash": None,
 }
 """Values that leave a field open: merl chooses a value for this machine and records its choice."""
 _DECIDED = {

@@ -32,6 +32,10 @@ class Outcome:
     saved: bool
     unwritten: int = 0
 
+    def was_stopped(self) -> bool:
+        """Return whether a signal stopped the run."""
+        return self.signal is not None
+
     def check_saved(self) -> None:
         """Check that the end of the run is saved.
 

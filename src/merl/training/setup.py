@@ -128,7 +128,7 @@ class Setup:
         """Return the source of batches: the run's replay, with its demonstrations if it has any."""
         if self.demos is None:
             return replay
-        return MixedReplay(replay, self.demos, self.config.replay.demos_ratio)
+        return MixedReplay(replay, self.demos, self.config.demos_ratio)
 
     @classmethod
     @contextmanager
@@ -222,24 +222,24 @@ def load_demos(
     Raises:
         MerlError: they cannot be read, do not fit the run, or are not those that it began with.
     """
-    replay, agent = config.replay, AGENTS.get(config.agent_name)
-    if replay.demos is None:
+    agent = AGENTS.get(config.agent_name)
+    if config.demos is None:
         if agent is not None and agent.imitates:
             raise MerlError(
                 f"agent {config.agent_name} learns from demonstrations alone: name a folder of "
-                "them with --replay.demos; `merl demos record` makes one"
+                "them with --demos; `merl demos record` makes one"
             )
         if isinstance(config.agent, AgentConfig) and config.agent.clone_weight:
             raise MerlError(
                 f"agent.clone-weight {config.agent.clone_weight} clones demonstrations: name a "
-                "folder of them with --replay.demos"
+                "folder of them with --demos"
             )
         return None, config
-    found = Demonstrations.open(home / replay.demos)
+    found = Demonstrations.open(home / config.demos)
     if found.task != config.task:
         raise MerlError(
             f"{found.path} holds demonstrations of {found.task}, not of {config.task}: name others "
-            "with --replay.demos"
+            "with --demos"
         )
     form = {} if config.has_user_env else {"reward": config.env.reward}
     for name, value in form.items():
@@ -249,14 +249,13 @@ def load_demos(
                 f"{value}: their rewards do not mix"
             )
     digest = found.digest()
-    if replay.demos_hash not in (None, digest):
+    if config.demos_hash not in (None, digest):
         raise MerlError(
             f"{found.path} holds other demonstrations than those with which the run began: restore "
-            "them, or name their folder with --replay.demos"
+            "them, or name their folder with --demos"
         )
-    replay = dataclasses.replace(replay, demos=found.path, demos_hash=digest)
     loaded = found.load(config.replay, space, action_space)
-    return loaded, dataclasses.replace(config, replay=replay)
+    return loaded, dataclasses.replace(config, demos=found.path, demos_hash=digest)
 
 
 def choose_device(name: str) -> torch.device:

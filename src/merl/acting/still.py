@@ -46,8 +46,8 @@ class StillEnvs:
         return [Step(self._zeros, 0.0, False, self._steps == EPISODE, {})] * self.count
 
     def states(self) -> list[dict[str, Any]]:
-        """See `Environments`."""
-        return [{}] * self.count
+        """See `Environments`; there are no random numbers to restore."""
+        return [{"bit_generator": None}] * self.count
 
     def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
         """Do nothing."""

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from merl.core import CallbackFailed, MerlError
@@ -27,6 +29,18 @@ class Callback:
 
     def on_start(self, trainer: Trainer) -> None:
         """Handle the start or the resume of training, at step `trainer.progress.step`."""
+
+    def correct(self, actions: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """Return the actions to execute in place of the agent's, or None to leave them.
+
+        For a person who takes over for a while: the steps of an environment whose action differs
+        are added to the demonstrations, which the run must have (`demos`), and written to the
+        run's folder `corrections`.
+
+        Args:
+            actions: (N, A), in [-1, 1], one row for each environment.
+        """
+        return None
 
     def on_episode(self, step: int, metrics: Mapping[str, float]) -> None:
         """Handle the end of an episode; the metrics are the new row of `metrics.csv`."""
@@ -74,6 +88,21 @@ class CallbackList(Callback):
             return partial(self._notify, name)
         return super().__getattribute__(name)
 
+    def corrects(self) -> bool:
+        """Return whether any of the callbacks may correct actions."""
+        return any(type(each).correct is not Callback.correct for each in self._callbacks)
+
+    def correct(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the actions as the callbacks correct them, one after the other."""
+        for callback in self._callbacks:
+            try:
+                corrected = callback.correct(actions)
+            except Exception as error:
+                name = f"{type(callback).__name__}.correct"
+                raise CallbackFailed(f"callback {name} raised {in_one_line(error)}") from error
+            actions = actions if corrected is None else _checked(callback, corrected, actions.shape)
+        return actions
+
     def _notify(self, event: str, *args: Any) -> bool:
         """Call the method `event` of every callback; return False if one of them returned False."""
         goes_on = True
@@ -90,3 +119,19 @@ class CallbackList(Callback):
                 else:
                     raise failure from error
         return goes_on
+
+
+def _checked(callback: Callback, actions: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return corrected actions as float32.
+
+    Raises:
+        MerlError: they have another shape, or a value is not a number in [-1, 1].
+    """
+    found = np.asarray(actions, np.float32)
+    if found.shape != shape or not (np.abs(found) <= 1.0).all():
+        raise MerlError(
+            f"{type(callback).__name__}.correct returned an array of shape {found.shape} from "
+            f"{found.min():g} to {found.max():g}: return None, or {shape} numbers in "
+            "[-1, 1]"
+        )
+    return found

@@ -45,7 +45,7 @@ def replay_of(value: float, steps: int = 30, intended: float | None = None) -> R
 
 @pytest.mark.parametrize(("ratio", "count"), [(0.5, 8), (0.25, 4), (1.0, 16), (0.001, 1)])
 def test_the_first_samples_are_demonstrations(ratio: float, count: int) -> None:
-    mixed = MixedReplay(replay_of(0.1), replay_of(0.7, intended=0.6), ratio)
+    mixed = MixedReplay(replay_of(0.1), [replay_of(0.7, intended=0.6)], ratio)
     batch = mixed.sample(16, np.random.default_rng(0))
     assert list(batch.observation) == list(batch.next_observation) == ["image", "joint"]
     assert batch.shown is not None
@@ -62,9 +62,9 @@ def test_the_first_samples_are_demonstrations(ratio: float, count: int) -> None:
 def test_random_shifts_belong_to_their_samples() -> None:
     own, demos = replay_of(0.1), replay_of(0.7, intended=0.7)
     shifts = torch.randint(0, 5, (10, 2), generator=torch.Generator().manual_seed(0))
-    plain = MixedReplay(own, demos, 0.3).sample(10, np.random.default_rng(3))
+    plain = MixedReplay(own, [demos], 0.3).sample(10, np.random.default_rng(3))
     transform = {"image": RandomShift(shifts, 2)}
-    shifted = MixedReplay(own, demos, 0.3).sample(
+    shifted = MixedReplay(own, [demos], 0.3).sample(
         10, np.random.default_rng(3), transform, transform
     )
     for before, after in (
@@ -75,6 +75,6 @@ def test_random_shifts_belong_to_their_samples() -> None:
 
 
 def test_equal_generators_give_equal_batches() -> None:
-    mixed = MixedReplay(replay_of(0.1), replay_of(0.7, intended=0.7), 0.5)
+    mixed = MixedReplay(replay_of(0.1), [replay_of(0.7, intended=0.7)], 0.5)
     first, second = (mixed.sample(8, np.random.default_rng(5)) for _ in range(2))
     torch.testing.assert_close(first.observation, second.observation)

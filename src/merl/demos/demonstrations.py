@@ -13,7 +13,7 @@ import hashlib
 import json
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -98,7 +98,7 @@ class Demonstrations:
             raise MerlError(
                 f"{path} holds no demonstrations: it has no {INDEX}; `merl demos record` makes "
                 "them (if they were moved, resume their run with the command that began it, with "
-                "--resume and their new --replay.demos)"
+                "--resume and their new --demos)"
             ) from None
         except OSError as error:
             raise MerlError(f"{file} cannot be read: {error.strerror}") from None
@@ -200,22 +200,26 @@ class Demonstrations:
         spec = ReplaySpec.of(config, space, action_space, capacity=capacity)
         replay = ReplayBuffer(spec)
         for episode in self.episodes():
-            stored = {key: episode.observations[key] for key in observation_space}
-            after = np.zeros_like(episode.intended[:1])  # there is no action after the last step
-            stored[INTENDED] = np.concatenate([episode.intended, after])
-            replay.begin({key: values[0] for key, values in stored.items()})
-            for step in range(len(episode)):
-                last = step == len(episode) - 1
-                replay.add(
-                    Transition(
-                        episode.actions[step],
-                        float(episode.rewards[step]),
-                        0.0 if last and episode.terminated else 1.0,
-                        {key: values[step + 1] for key, values in stored.items()},
-                        last,
-                    )
-                )
+            store(episode, replay, observation_space)
         return replay
+
+
+def store(episode: Episode, replay: ReplayBuffer, keys: Iterable[str]) -> None:
+    """Write an episode, with these keys of its observations, into a replay buffer."""
+    stored = {key: episode.observations[key] for key in keys}
+    after = np.zeros_like(episode.intended[:1])  # there is no action after the last step
+    stored[INTENDED] = np.concatenate([episode.intended, after])
+    replay.begin({key: values[0] for key, values in stored.items()})
+    for step in range(len(episode)):
+        last = step == len(episode) - 1
+        transition = Transition(
+            episode.actions[step],
+            float(episode.rewards[step]),
+            0.0 if last and episode.terminated else 1.0,
+            {key: values[step + 1] for key, values in stored.items()},
+            last,
+        )
+        replay.add(transition)
 
 
 def _line(values: Any) -> Line:

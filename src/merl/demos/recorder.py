@@ -26,9 +26,10 @@ class Recorder:
         source: who acts.
         observation_space, action_space: spaces of the environment.
         options: options of the task, if it is one of merl's.
+        append: add to the demonstrations that the folder holds, if it does.
 
     Raises:
-        MerlError: the folder holds files, or cannot be created.
+        MerlError: the folder holds other files, or cannot be created.
     """
 
     def __init__(
@@ -39,7 +40,13 @@ class Recorder:
         observation_space: spaces.Dict,
         action_space: spaces.Box,
         options: Mapping[str, Any] | None = None,
+        *,
+        append: bool = False,
     ) -> None:
+        if append and (path / INDEX).exists():
+            self.demonstrations = Demonstrations.open(path)
+            self.demonstrations.check_fits(observation_space, action_space)
+            return
         check_free(path)
         self.demonstrations = Demonstrations(
             path, task, source, observation_space, action_space, (), options or {}

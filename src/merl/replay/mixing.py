@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from merl.core import Batch, FrameTransform, FrameTransforms
 from merl.replay.buffer import ReplayBuffer
@@ -21,11 +23,12 @@ class MixedReplay:
 
     Args:
         own: the replay of the run.
-        demos: the demonstrations, with the intended actions as observation `INTENDED`.
+        demos: the demonstrations, the first of which are not empty, with the intended actions as
+            observation `INTENDED`; each step of any of them has the same probability.
         ratio: share of the demonstrations in a batch, in (0, 1].
     """
 
-    def __init__(self, own: ReplayBuffer, demos: ReplayBuffer, ratio: float) -> None:
+    def __init__(self, own: ReplayBuffer, demos: Sequence[ReplayBuffer], ratio: float) -> None:
         self.own, self.demos, self.ratio = own, demos, ratio
 
     def sample(
@@ -36,27 +39,37 @@ class MixedReplay:
         then: FrameTransforms | None = None,
     ) -> Batch:
         """Draw a batch; see `ReplayBuffer.sample`."""
-        count = max(1, round(self.ratio * batch_size))
-        shown = _with_intended(self.demos.sample(count, rng, now, then))
-        if count == batch_size:
-            return shown
-        own = self.own.sample(
-            batch_size - count, rng, _moved(now or {}, count), _moved(then or {}, count)
-        )
-        return Batch(
-            {
-                key: torch.cat([shown.observation[key], own.observation[key]])
-                for key in own.observation
-            },
-            torch.cat([shown.action, own.action]),
-            torch.cat([shown.reward, own.reward]),
-            torch.cat([shown.discount, own.discount]),
-            {
-                key: torch.cat([shown.next_observation[key], own.next_observation[key]])
-                for key in own.next_observation
-            },
-            shown.shown,
-        )
+        shown = max(1, round(self.ratio * batch_size))
+        counts, parts, drawn = [shown], list[Batch](), 0
+        if len(self.demos) > 1:
+            lengths = np.array([len(each) for each in self.demos])
+            counts = rng.multinomial(shown, lengths / lengths.sum()).tolist()
+        sources = [*zip(self.demos, counts, strict=True), (self.own, batch_size - shown)]
+        for source, count in sources:
+            if not count:
+                continue
+            moved = (_moved(each or {}, drawn) for each in (now, then))
+            part = source.sample(count, rng, *moved)
+            parts.append(part if source is self.own else _with_intended(part))
+            drawn += count
+        return parts[0] if len(parts) == 1 else _joined(parts)
+
+
+def _joined(parts: Sequence[Batch]) -> Batch:
+    """Return one batch with the samples of several, in order."""
+    shown = [part.shown for part in parts if part.shown is not None]
+    return Batch(
+        _joined_values([part.observation for part in parts]),
+        torch.cat([part.action for part in parts]),
+        torch.cat([part.reward for part in parts]),
+        torch.cat([part.discount for part in parts]),
+        _joined_values([part.next_observation for part in parts]),
+        torch.cat(shown),
+    )
+
+
+def _joined_values(each: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+    return {key: torch.cat([values[key] for values in each]) for key in each[-1]}
 
 
 def _with_intended(batch: Batch) -> Batch:

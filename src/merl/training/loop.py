@@ -23,6 +23,7 @@ from merl.config import TrainConfig
 from merl.core import Agent, MerlError, Transition
 from merl.core.guards import check_finite
 from merl.replay import ReplayBuffer
+from merl.training.corrections import Corrections
 
 
 @dataclass
@@ -177,14 +178,20 @@ class Collector:
         environments: one or several environments.
         replay: the replay, with a ring for each environment.
         stacks: a frame stack for each environment.
+        corrections: lets callbacks correct the actions; None if none does.
 
     Attributes:
         broken: whether a worker process died; then all restart before the next episode.
     """
 
     def __init__(
-        self, environments: Environments, replay: ReplayBuffer, stacks: list[FrameStack]
+        self,
+        environments: Environments,
+        replay: ReplayBuffer,
+        stacks: list[FrameStack],
+        corrections: Corrections | None = None,
     ) -> None:
+        self._corrections = corrections
         self.environments, self.replay, self.stacks = environments, replay, stacks
         self.broken = False
         self._seeds: dict[int, int] = {}
@@ -221,11 +228,13 @@ class Collector:
             check_finite(observation, 0.0, progress.step, self._where(index))
             self.replay.begin(self.stacks[index].reset(observation), index)
             self._episodes[index] = Episode()
+            if self._corrections is not None:
+                self._corrections.begin(index, observation)
 
     def act(self, actions: NDArray[np.float32]) -> None:
         """Start a step of the environments with actions (count, A)."""
-        self._actions = actions
-        self.environments.send(actions)
+        self._actions = actions if self._corrections is None else self._corrections.apply(actions)
+        self.environments.send(self._actions)
 
     def store(self, progress: Progress, repeat: int) -> tuple[Episode, ...]:
         """Wait for the step and store its transitions; return the episodes that ended."""
@@ -241,6 +250,8 @@ class Collector:
             self.replay.add(transition, index)
             self._episodes[index].add(step.reward, step.info)
             progress.step += repeat
+            if self._corrections is not None:
+                self._corrections.add(index, step)
             if over:
                 ended.append(self._episodes.pop(index))
         return tuple(ended)

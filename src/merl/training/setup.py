@@ -33,6 +33,7 @@ from merl.replay import ReplayBuffer, ReplaySpec, check_fits
 from merl.replay.mixing import MixedReplay
 from merl.runs.resume import left_open
 from merl.runs.run_folder import refuse_existing, run_path
+from merl.training.corrections import Corrections
 from merl.training.loop import Progress, Randomness
 from merl.training.timing import measure
 
@@ -124,11 +125,14 @@ class Setup:
         kind = AGENTS.get(self.config.agent_name)
         return kind is not None and kind.imitates
 
-    def batches_from(self, replay: ReplayBuffer) -> ReplayBuffer | MixedReplay:
+    def batches_from(
+        self, replay: ReplayBuffer, corrections: Corrections | None
+    ) -> ReplayBuffer | MixedReplay:
         """Return the source of batches: the run's replay, with its demonstrations if it has any."""
         if self.demos is None:
             return replay
-        return MixedReplay(replay, self.demos, self.config.demos_ratio)
+        demos = [self.demos] if corrections is None else [self.demos, corrections.replay]
+        return MixedReplay(replay, demos, self.config.demos_ratio)
 
     @classmethod
     @contextmanager

@@ -22,6 +22,7 @@ from merl.replay import ReplayBuffer
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
+from merl.training.corrections import Corrections
 from merl.training.evaluator import Evaluations
 from merl.training.initial import load_initial_weights
 from merl.training.loop import Collector, Progress, StepResult, train
@@ -163,6 +164,8 @@ class Trainer:
             with self._interrupt.raising():
                 self._environments = setup.make_environments()
             stack.callback(self._environments.close)
+            corrections = Corrections.of(self._callbacks, setup, run)
+            self._corrections = stack.enter_context(corrections)
             self.evaluations = Evaluations(setup, run, self.clock, self._callbacks, self._interrupt)
             self._saver = Saver(
                 setup,
@@ -263,7 +266,7 @@ class Trainer:
         ]
         update = make_update(
             setup.agent,
-            setup.batches_from(self.replay),
+            setup.batches_from(self.replay, self._corrections),
             setup.randomness,
             self.config,
             setup.device,
@@ -271,7 +274,7 @@ class Trainer:
             setup.progress.updates,
         )
         return train(
-            Collector(self._environments, self.replay, stacks),
+            Collector(self._environments, self.replay, stacks, self._corrections),
             setup.agent,
             update,
             setup.progress,
@@ -308,11 +311,9 @@ class Trainer:
         if self._worker_losses > most:
             self._saver.save()
             step, line = self.progress.step, resume_line(self.run.path)
-            end = f"the run is saved at step {step:,}; resume with `{line}`"
-            raise EnvironmentsLost(
-                f"{what}, after {counted(most, 'restart')}: "
-                + (end if step else "the run ends before its first step")
-            )
+            saved = f"the run is saved at step {step:,}; resume with `{line}`"
+            end = saved if step else "the run ends before its first step"
+            raise EnvironmentsLost(f"{what}, after {counted(most, 'restart')}: {end}")
         self.warn(
             f"{what}: starting the environments again (restart {self._worker_losses} of {most})"
         )
@@ -337,8 +338,7 @@ class Trainer:
         progress.reports_success |= report_success(result.episodes)
         means = mean_metrics(result.episodes, reports_success=progress.reports_success)
         values = {} if self.setup.imitates else {f"train/{k}": v for k, v in means.items()}
-        values |= self._averages.take()
-        values |= self.clock.rates(progress)
+        values |= self._averages.take() | self.clock.rates(progress)
         values |= {"replay/steps": float(len(self.replay))}
         if self.config.has_workers:
             values["workers/restarts"] = float(progress.restarts)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from merl.core import MerlError
 from merl.envs.arm_env import ArmEnv
 from merl.tasks.expert import make_expert
+from merl.tasks.hand_control import AXES, HandControl
 
 
 class ExpertPolicy:
@@ -52,3 +53,24 @@ class ExpertPolicy:
             self._expert.reset()
         self._fresh = False
         return self._env.action_for(self._expert.act())
+
+
+class HandMotion:
+    """Actions that move the hand as a person commands it.
+
+    Args:
+        env: an `ArmEnv`, wrapped or not; wrappers must not change the actions.
+
+    Raises:
+        MerlError: the robot has another hand than the Jaco hand.
+    """
+
+    axes = AXES
+
+    def __init__(self, env: ArmEnv) -> None:
+        self._env, self._control = env, HandControl(env.task, env.physics)
+
+    def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the action for a command, (5,), in [-1, 1], in the order of `axes`."""
+        self._control.command = command
+        return self._env.action_for(self._control.act())

@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file
 
 from helpers import flat
 from merl.cli import main
 from merl.demos.demonstrations import Demonstrations
 from merl.evaluation.demonstrating import record_episodes
+from merl.report.film import LABEL, MARGIN, SIDE
 from toy import DotEnv
 
 TINY = ["--preset", "smoke", "--agent.keys", "proprio", "--eval.video", "none", "--threads", "1"]
@@ -203,3 +205,20 @@ def test_an_exported_dataset_is_imported_and_learnt_from(
 def test_another_environment_has_no_expert(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demos", "record", "Pendulum-v1"]) != 0
     assert "there is no expert for Pendulum-v1" in flat(capsys.readouterr().err)
+
+
+def test_a_film_strip_shows_what_the_cameras_saw(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    film = tmp_path / "film.png"
+    assert main(["demos", "show", str(demos), "--film", str(film)]) == 0
+    assert f"frames: {film}" in flat(capsys.readouterr().out)
+    strip = np.asarray(Image.open(film).convert("RGB"))
+    episodes = [episode.observations["image"] for episode in Demonstrations.open(demos).episodes()]
+    assert strip.shape[0] == len(episodes) * (SIDE + MARGIN)
+    step = SIDE / 32  # pixels of the strip for each pixel of the camera
+    for row, frames in enumerate(episodes):
+        top = row * (SIDE + MARGIN)
+        first = strip[top : top + SIDE, LABEL : LABEL + SIDE]
+        centres = (np.arange(32) * step + step / 2).astype(int)
+        np.testing.assert_array_equal(first[np.ix_(centres, centres)], frames[0])

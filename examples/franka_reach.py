@@ -1,11 +1,12 @@
 """Another arm in merl's own tasks: a Franka Panda reaches a brick on the floor.
 
     pip install --no-deps gymnasium-robotics
-    merl train franka_reach:make_env --preset laptop
-    merl train franka_reach:from_state --preset state
+    merl train franka_reach:from_state --preset state --updates-per-step 0.25
+    merl train franka_reach:make_env --preset laptop --updates-per-step 0.25
 
 The package contains a model of the arm; its code is not used. Copy this file for an arm of your
-own: docs/howto/another_arm.md says what to change. Lengths are in metres, angles in radians.
+own: docs/howto/another_arm.md says what to change, and shows results. Lengths are in metres, angles
+in radians.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ ALLOWED_SKIPS = (
     r"this machine has CUDA",
     r"this machine has no CUDA device",
     r"no Chromium on this machine",
-    r"timm is not installed",
+    r"(timm|gymnasium-robotics) is not installed",
     r"this system does not allow users to mount a disk",
     r"could not import '(tensorboard|wandb|trackio|nbclient|ipykernel|onnxruntime)",
 )

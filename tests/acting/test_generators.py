@@ -9,10 +9,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from dm_control import mjcf
 
 from merl.acting.environments import InProcessEnvs
 from merl.acting.generators import (
     global_state,
+    held_by,
     kept_generators,
     seed_global_generators,
     set_global_state,
@@ -145,3 +147,10 @@ def test_generators_in_containers_are_restored(hold: Any) -> None:
     with kept_generators(env):
         rng.random(5)
     assert rng.bit_generator.state == before
+
+
+def test_held_by_takes_a_made_up_dict_for_no_attributes() -> None:
+    physics = mjcf.Physics.from_mjcf_model(mjcf.RootElement())
+    binding = physics.bind([])  # it answers to every name with an array, also to __dict__
+    (only,) = held_by(SimpleNamespace(binding=binding))
+    assert only is binding

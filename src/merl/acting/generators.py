@@ -76,10 +76,16 @@ def kept_generators(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
 
 def held_by(owner: Any) -> Iterator[Any]:
     """Yield the attributes of an object, items of lists and dicts, and their attributes."""
-    for value in _parts(getattr(owner, "__dict__", {}).values()):
+    for value in _parts(_attributes(owner)):
         yield value
         if not isinstance(value, type | ModuleType | gymnasium.Env):
-            yield from _parts(getattr(value, "__dict__", {}).values())
+            yield from _parts(_attributes(value))
+
+
+def _attributes(owner: Any) -> Iterable[Any]:
+    """Return the values of an object's attributes."""
+    found = getattr(owner, "__dict__", None)  # dm_control's empty binding answers with an array
+    return found.values() if isinstance(found, Mapping) else ()
 
 
 def _parts(values: Iterable[Any]) -> Iterator[Any]:

@@ -22,9 +22,10 @@ class ArmEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """A Gymnasium environment for one task of a robot arm.
 
     An observation is a dict with the keys in `EnvConfig.observations`: `image` and `wrist` uint8
-    (H, W, 3), `depth` and `wrist_depth` float32 (H, W, 1) in m, `proprio` float32 (24,) or (42,),
-    `touch` float32 (7,), `state` float32 (n,). An action is float32 (9,) in [-1, 1]: the velocities
-    of the arm's six joints and of the three fingers, as fractions of their maximum.
+    (H, W, 3), `depth` and `wrist_depth` float32 (H, W, 1) in m, `proprio`, `touch` and `state`
+    float32 (n,). An action is in [-1, 1]: the velocities of the arm's joints and of the fingers, as
+    fractions of their maximum. The Jaco has `proprio` (24,) or (42,), `touch` (7,) and actions
+    (9,): six joints and three fingers.
 
     An episode has 250 steps of 0.04 s and ends by truncation. After each step, `info` holds
     `success` (1.0 if the task is solved in the current state, else 0.0), `distance` (the distance
@@ -90,7 +91,7 @@ class ArmEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Apply an action for 0.04 s.
 
         Args:
-            action: (9,); values outside [-1, 1] are clipped.
+            action: (n,); values outside [-1, 1] are clipped.
 
         Returns:
             Observation, reward in [0, 1], terminated (always False), truncated (True at the 250th
@@ -150,13 +151,13 @@ class ArmEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return physics
 
     def action_for(self, velocities: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the action (9,), in [-1, 1], for velocities of the joints (9,), rad/s."""
+        """Return the action, in [-1, 1], for velocities of the joints, both (n,), rad/s or m/s."""
         shares = (velocities - self._action_center) / self._action_scale
         action: NDArray[np.float32] = shares.clip(-1.0, 1.0).astype(np.float32)
         return action
 
     def _velocities(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Return the target velocities of the joints for an action, (9,), rad/s."""
+        """Return the target velocities of the joints for an action, both (n,), rad/s or m/s."""
         try:
             given = np.asarray(action)
             values = given.astype(np.float64) if given.dtype.kind in "fiu" else None

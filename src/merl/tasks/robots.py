@@ -37,7 +37,7 @@ class Robot:
 
     Args:
         arm: the arm; a torque sensor at each joint, in the joint's frame.
-        hand: the hand; this attaches it to the arm.
+        hand: the hand, attached to the arm or part of its model.
         position: position of the arm's base in the scene, m.
         palm: the largest geom of the hand. The hand's axis leads from its centre to the tool centre
             point.
@@ -58,7 +58,6 @@ class Robot:
         self.arm, self.hand, self.position = arm, hand, position
         self._palm_geom, self._touch_bodies = palm, touch_bodies
         self._touch_sensors: list[mjcf.Element] = []
-        arm.attach(hand)
 
     def add_touch_sensors(self) -> None:
         """Add MuJoCo's touch sensors to the hand, for `touch`; call this before `compile`."""
@@ -186,10 +185,11 @@ def jaco() -> Robot:
 
     Its base is where dm_control has it (`manipulation.shared.robots`).
     """
-    hand = kinova.JacoHand(use_pinch_site_as_tcp=True)
+    arm, hand = kinova.JacoArm(), kinova.JacoHand(use_pinch_site_as_tcp=True)
+    arm.attach(hand)
     fingers = [f"b_finger{part}_{n}" for n in (1, 2, 3) for part in ("", "_tip")]
     position = (0.0, 0.4, 0.0)
-    return Robot(kinova.JacoArm(), hand, position, hand.hand_geom[0], ["hand", *fingers])
+    return Robot(arm, hand, position, hand.hand_geom[0], ["hand", *fingers])
 
 
 def sensor_slice(physics: mjcf.Physics, sensors: Sequence[Any]) -> NDArray[np.intp]:
@@ -201,6 +201,6 @@ def sensor_slice(physics: mjcf.Physics, sensors: Sequence[Any]) -> NDArray[np.in
 
 
 def _addresses(physics: mjcf.Physics, joints: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the indices of hinge joints in qpos (positions) and in qvel (velocities)."""
+    """Return the indices of hinges or slides in qpos (positions) and in qvel (velocities)."""
     model = physics.model
     return model.jnt_qposadr[joints].copy(), model.jnt_dofadr[joints].copy()

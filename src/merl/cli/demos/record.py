@@ -17,7 +17,6 @@ from merl.core import MerlError
 from merl.core.fields import Range
 from merl.demos.episode import Episode
 from merl.demos.recorder import Recorder
-from merl.envs.arm_env import ArmEnv
 from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.envs.expert import ExpertPolicy, HandMotion
 from merl.envs.frame_rate import frame_rate
@@ -118,7 +117,7 @@ def _by_hand(options: RecordOptions, env: Any, stack: ExitStack) -> Iterator[Epi
     if options.noise:
         raise MerlError(f"noise {options.noise:g} is for a policy: a person's actions have none")
     motion: Callable[[Command], NDArray[np.float32]]
-    if isinstance(env.unwrapped, ArmEnv):
+    if options.task in ENV_IDS:
         motion = HandMotion(env.unwrapped)
         axes: tuple[str, ...] = HandMotion.axes
     else:

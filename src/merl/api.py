@@ -97,6 +97,7 @@ def resume(
     callbacks: Iterable[Callback] = (),
     progress: bool = True,
     trust: bool = False,
+    skip_damaged: bool = False,
 ) -> Outcome:
     """Resume a run from its last checkpoint.
 
@@ -110,6 +111,8 @@ def resume(
         callbacks: called while it trains. The loggers of the run's config log again by themselves.
         progress: see `train`.
         trust: see `evaluate`.
+        skip_damaged: if parts of the replay are damaged, leave out their episodes, with a warning,
+            instead of raising an error.
 
     Returns:
         As `train`. The outcome of a run that has ended already has no evaluation.
@@ -124,7 +127,8 @@ def resume(
         if found.done is not None:
             return found.done
         resumed = found.run, found.start
-        return _fit(found.config, callbacks, progress, make=env, resumed=resumed)
+        options = {"make": env, "resumed": resumed, "skip_damaged": skip_damaged}
+        return _fit(found.config, callbacks, progress, **options)
 
 
 def evaluate(

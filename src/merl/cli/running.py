@@ -6,6 +6,7 @@ import sys
 from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.filesize import decimal
@@ -27,6 +28,8 @@ from merl.training.setup import Setup
 from merl.training.trainer import Trainer
 
 DAY = 86_400.0  # seconds
+Damaged = Literal["refuse", "skip"]
+"""What to do with a replay of which a part is damaged."""
 
 
 def begin(config: TrainConfig, source: Source, what: str) -> int:
@@ -47,13 +50,18 @@ def go_on(
     *,
     trusted: bool = False,
     named_in: Path | None = None,
+    skip_damaged: bool = False,
 ) -> int:
-    """Resume a run and train it to its end; return the exit code. See `resumption`."""
+    """Resume a run and train it to its end; return the exit code.
+
+    See `resumption`, and `Trainer` for `skip_damaged`.
+    """
     with resumption(run, asked, given_open, trusted=trusted, named_in=named_in) as found:
         if found.done is not None:
             print(found.what)
             return 0
-        return _train(found.config, found.what, (found.run, found.start))
+        resumed = found.run, found.start
+        return _train(found.config, found.what, resumed, skip_damaged=skip_damaged)
 
 
 def tell_trusted(run: Run) -> None:
@@ -67,12 +75,12 @@ def _train(
     config: TrainConfig,
     what: str,
     resumed: tuple[Run, Checkpoint | None] | None = None,
-    source: Source = CUSTOM,
+    **options: Any,
 ) -> int:
-    """Train, print the result, and return the exit code."""
+    """Train, print the result, and return the exit code; `options`: those of `Trainer`."""
     console = make_console()
     try:
-        outcome = _fit(config, what, resumed, source, console)
+        outcome = _fit(config, what, resumed, console, **options)
     except KeyboardInterrupt:  # during training, `Interrupt` defers signals
         console.print("stopped before training began: nothing was written")
         raise
@@ -96,14 +104,19 @@ def _fit(
     config: TrainConfig,
     what: str,
     resumed: tuple[Run, Checkpoint | None] | None,
-    source: Source,
     console: Console,
+    *,
+    source: Source = CUSTOM,
+    skip_damaged: bool = False,
 ) -> Outcome:
     """Train with the live view; the trainer and the files that it maps are gone at the end."""
     with ExitStack() as stack:
         view = LiveView(console, _scale(config))
         with console.status("building the scene and timing this machine", spinner="line"):
-            trainer = stack.enter_context(Trainer(config, [view], source=source, resumed=resumed))
+            trainer = Trainer(
+                config, [view], source=source, resumed=resumed, skip_damaged=skip_damaged
+            )
+            stack.enter_context(trainer)
         done = resumed[1].step if resumed and resumed[1] else 0
         console.print(_outlook(trainer.setup, what, done), highlight=False)
         seconds = trainer.setup.timing.seconds(trainer.config)

@@ -86,6 +86,22 @@ def open_copy(directory: Path, spec: ReplaySpec) -> Storage:
     return _mapped(folder, spec, int(folder.name), mmap.ACCESS_COPY)
 
 
+def holds_steps(directory: Path) -> bool:
+    """Return whether a folder holds a replay with a timestep.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    folder = folder_in(directory)
+    if folder is None:
+        return False
+    with open_file(folder / "timestep.bin") as file:
+        while chunk := file.read(1 << 20):
+            if any(chunk):
+                return True
+    return False
+
+
 def folder_in(directory: Path) -> Path | None:
     """Return the folder of an existing replay, the largest; None if there is none."""
     folders = [path for path in directory.glob("*") if path.name.isdecimal()]

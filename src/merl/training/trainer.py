@@ -50,6 +50,8 @@ class Trainer:
         source: where the config's values come from; recorded with a new run.
         resumed: None for a new run; else the run to resume, whose lock the caller holds, and the
             checkpoint to resume from, or None to start at the first step.
+        skip_damaged: if parts of the resumed run's replay are damaged, leave out their episodes
+            instead of raising an error.
         make: makes the environment, if the config does not name it; see `make_run_env`.
 
     Attributes:
@@ -77,6 +79,7 @@ class Trainer:
         *,
         source: Source = CUSTOM,
         resumed: tuple[Run, Checkpoint | None] | None = None,
+        skip_damaged: bool = False,
         make: MakeEnv | None = None,
     ) -> None:
         if _TRAINING.locked():
@@ -93,6 +96,7 @@ class Trainer:
                 load_initial_weights(setup.agent, setup.home)
             self._resources = stack.pop_all()
         self.config, self._source, self._resumed = setup.config, source, resumed
+        self._skip_damaged = skip_damaged
         self._averages, self._guard = Averages(), LossGuard()
         self._worker_losses = 0
         self._stops = False  # a callback stops training
@@ -175,7 +179,7 @@ class Trainer:
                 self._callbacks,
             )
             if start is not None:
-                self._saver.restore(start)
+                self._saver.restore(start, skip_damaged=self._skip_damaged)
             if self._resumed is not None:
                 run.record_resumption(start.step if start else 0)
             outcome = None

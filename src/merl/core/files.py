@@ -13,7 +13,7 @@ import stat
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, BinaryIO, cast
 
 MOST_TEXT = 1 << 28
 """Bytes of the largest text file that is read: a hundred times the longest run's metrics."""
@@ -44,7 +44,7 @@ def check_kind(path: Path) -> None:
 
 def open_file(
     path: Path, mode: str = "rb", *, most: int | None = None, buffering: int = -1
-) -> IO[bytes]:
+) -> BinaryIO:
     """Open a file in a binary mode.
 
     Args:
@@ -57,7 +57,7 @@ def open_file(
         OSError: it cannot be opened, is not a file, or is larger.
     """
     check_kind(path)
-    file: IO[bytes] = path.open(mode, buffering)
+    file = cast(BinaryIO, path.open(mode, buffering))
     size = os.fstat(file.fileno()).st_size
     if most is not None and size > most:
         file.close()

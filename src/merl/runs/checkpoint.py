@@ -16,10 +16,10 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError
@@ -35,7 +35,7 @@ FORMAT = 1
 _WEIGHTS, _LEARNER = "weights.safetensors", "learner.pt"
 _STATE, _MANIFEST = "state.json", "manifest.json"
 _FILES = (_WEIGHTS, _LEARNER, _STATE)
-_BAD_VALUES = (ValueError, TypeError, AttributeError, RecursionError)
+_BAD_VALUES = (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
 _CPU = torch.device("cpu")
 _LOG = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ class Checkpoint:
             missing = {*_FILES} - {*files.keys()}
             if missing:
                 raise ValueError(f"it does not list {', '.join(sorted(missing))}")
-        except (OSError, LookupError, ArithmeticError, *_BAD_VALUES) as error:
+        except (OSError, LookupError, *_BAD_VALUES) as error:
             raise MerlError(f"checkpoint {path} has no readable manifest ({error})") from None
         if number != FORMAT:
             raise MerlError(
@@ -168,12 +168,11 @@ def save(
     try:
         with torch_settings(_CPU):
             _write(part, weights, learnt, state)
-        names = (_WEIGHTS, _LEARNER, _STATE)
         manifest = {
             "format": FORMAT,
             "step": step,
             "score": score,
-            "files": {name: _fingerprint(part / name) for name in names},
+            "files": {name: _fingerprint(part / name) for name in _FILES},
         }
         (part / _MANIFEST).write_text(json.dumps(sealed(manifest), indent=1))
         for path in (*part.iterdir(), part):
@@ -211,7 +210,7 @@ def load_policy_of(agent: Agent, checkpoint: Checkpoint) -> None:
     """Restore an agent's policy to act only; the checkpoint may come from another device.
 
     Raises:
-        MerlError: a file cannot be read, or does not match the agent.
+        MerlError: see `load_agent`.
     """
     with readable(checkpoint), torch_settings(_CPU):
         agent.load_policy(_weights(checkpoint))
@@ -230,15 +229,11 @@ def readable(checkpoint: Checkpoint) -> Iterator[None]:
         raise
     except (
         OSError,
-        ArithmeticError,
+        LookupError,
         MemoryError,
         RuntimeError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        RecursionError,
         SafetensorError,
+        *_BAD_VALUES,
     ) as error:
         why = " ".join(line.strip() for line in str(error).strip().split("\n")[:2])
         raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {why}") from None
@@ -302,9 +297,7 @@ def _write(
 
 def folders(root: Path) -> list[Path]:
     """Return the folders of checkpoints in the order of their steps."""
-    if not root.is_dir():
-        return []
-    found = [path for path in root.iterdir() if path.is_dir() and _is_number(path.name)]
+    found = [path for path in root.glob("*") if path.is_dir() and _is_number(path.name)]
     return sorted(found, key=lambda path: int(path.name))
 
 
@@ -324,8 +317,12 @@ def _prune(root: Path, step: int, keep: int) -> None:
     best = max(scores, key=lambda path: scores[path]) if scores else None
     stale = [path for path in root.glob(".part-*") if path.is_dir()]
     for path in [*stale, *(path for path in every if path not in past), *past[:-keep]]:
-        if path != best:
-            shutil.rmtree(path, ignore_errors=True)
+        if path == best:
+            continue
+        if path not in stale:  # a process that dies here leaves no half of a checkpoint
+            with suppress(OSError):
+                path = path.rename(root / f".part-{path.name}-pruned")
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _scores(paths: list[Path]) -> Iterator[tuple[Path, float | None]]:
@@ -339,7 +336,7 @@ def _scores(paths: list[Path]) -> Iterator[tuple[Path, float | None]]:
 def _fingerprint(path: Path, most: int | None = None) -> dict[str, Any]:
     """Return size and SHA-256 of a file of at most `most` bytes."""
     with open_file(path, most=most) as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        digest = hashlib.file_digest(cast(io.BufferedReader, file), "sha256").hexdigest()
     return {"bytes": path.stat().st_size, "sha256": digest}
 
 

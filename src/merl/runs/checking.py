@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,11 +74,15 @@ def _check_replay(run: Run, start: Checkpoint) -> Iterator[Finding]:
 @contextmanager
 def _not_in_use(run: Path) -> Iterator[None]:
     """Hold the lock of a run, if it has one, without writing into it."""
-    try:
-        with open_file(run / LOCK_FILE) as file:
+    path = run / LOCK_FILE
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(open_file(path))
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            yield
-    except FileNotFoundError:
+        except FileNotFoundError:
+            pass
+        except BlockingIOError:
+            raise MerlError(f"a process is training in {run}: stop it first") from None
+        except OSError as error:
+            raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
         yield
-    except BlockingIOError:
-        raise MerlError(f"a process is training in {run}: stop it first") from None

@@ -235,6 +235,8 @@ class ReplayBuffer:
             self._use(storage)
             for ring, shorter in zip(self.rings, rings, strict=True):
                 ring.copy_from(shorter)
+        if self._journal is not None:
+            self._journal.forget_former()
 
     def _draw(self, batch_size: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Return ring, first timestep, and the ring's newest timestep of each sample."""

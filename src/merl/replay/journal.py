@@ -96,13 +96,19 @@ class Journal:
 
     def begin_anew(self) -> None:
         """Begin new records after a checkpoint, and keep those since the checkpoint before it."""
+        self._is_complete = True
         try:
             self._path.replace(self._path.with_suffix(_FORMER))
-            self._file.close()
-            self._file = open_file(self._path, "a+b", buffering=0)
+            file = open_file(self._path, "a+b", buffering=0)
         except OSError:  # the folder cannot be written any more
             self._file.truncate(0)
-        self._is_complete = True
+        else:
+            self._file.close()
+            self._file = file
+
+    def forget_former(self) -> None:
+        """Remove the records for the checkpoint before the last: the arrays have moved."""
+        self._path.with_suffix(_FORMER).unlink(missing_ok=True)
 
 
 class _Record(NamedTuple):

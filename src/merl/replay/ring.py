@@ -154,9 +154,9 @@ class EpisodeRing:
         """
         timesteps = int(state["timesteps"])
         self._checksums = Checksums(self._all)
+        if covered is not None and damage:
+            self._leave_out(covered, damage)
         if timesteps == 0 or self._data["timestep"][self._slot(timesteps)] == timesteps:
-            if covered is not None and damage:
-                self._leave_out(covered, damage)
             oldest = covered["oldest"] if covered else 1
             self._rebuild(timesteps, int(state["steps"]), bool(state["open"]), oldest)
             self._confirmed = timesteps

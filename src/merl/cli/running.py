@@ -6,7 +6,7 @@ import sys
 from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rich.console import Console
 from rich.filesize import decimal
@@ -61,7 +61,7 @@ def go_on(
             print(found.what)
             return 0
         resumed = found.run, found.start
-        return _train(found.config, found.what, resumed, skip_damaged=skip_damaged)
+        return _train(found.config, found.what, resumed, CUSTOM, skip_damaged)
 
 
 def tell_trusted(run: Run) -> None:
@@ -75,12 +75,13 @@ def _train(
     config: TrainConfig,
     what: str,
     resumed: tuple[Run, Checkpoint | None] | None = None,
-    **options: Any,
+    source: Source = CUSTOM,
+    skip_damaged: bool = False,
 ) -> int:
-    """Train, print the result, and return the exit code; `options`: those of `Trainer`."""
+    """Train, print the result, and return the exit code."""
     console = make_console()
     try:
-        outcome = _fit(config, what, resumed, console, **options)
+        outcome = _fit(config, what, resumed, source, skip_damaged, console)
     except KeyboardInterrupt:  # during training, `Interrupt` defers signals
         console.print("stopped before training began: nothing was written")
         raise
@@ -104,10 +105,9 @@ def _fit(
     config: TrainConfig,
     what: str,
     resumed: tuple[Run, Checkpoint | None] | None,
+    source: Source,
+    skip_damaged: bool,
     console: Console,
-    *,
-    source: Source = CUSTOM,
-    skip_damaged: bool = False,
 ) -> Outcome:
     """Train with the live view; the trainer and the files that it maps are gone at the end."""
     with ExitStack() as stack:

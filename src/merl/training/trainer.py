@@ -50,8 +50,7 @@ class Trainer:
         source: where the config's values come from; recorded with a new run.
         resumed: None for a new run; else the run to resume, whose lock the caller holds, and the
             checkpoint to resume from, or None to start at the first step.
-        skip_damaged: if parts of the resumed run's replay are damaged, leave out their episodes
-            instead of raising an error.
+        skip_damaged: see `Saver.restore`.
         make: makes the environment, if the config does not name it; see `make_run_env`.
 
     Attributes:
@@ -96,10 +95,8 @@ class Trainer:
                 load_initial_weights(setup.agent, setup.home)
             self._resources = stack.pop_all()
         self.config, self._source, self._resumed = setup.config, source, resumed
-        self._skip_damaged = skip_damaged
-        self._averages, self._guard = Averages(), LossGuard()
-        self._worker_losses = 0
-        self._stops = False  # a callback stops training
+        self._averages, self._guard, self._skip_damaged = Averages(), LossGuard(), skip_damaged
+        self._worker_losses, self._stops = 0, False  # stops: a callback ends the training
 
     def __enter__(self) -> Trainer:
         """Return the trainer."""

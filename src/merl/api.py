@@ -89,7 +89,7 @@ def train(
         override(task, overrides),
         source,
         lambda first: _fit(first, (), progress, make=make, source=source),
-        lambda run, first: _resume(run, first, (), progress, make, trusted=False),
+        lambda run, first: _resume(run, first, (), progress, make),
         Outcome.was_stopped,
     )
     config, stopped = first_part
@@ -108,6 +108,7 @@ def resume(
     callbacks: Iterable[Callback] = (),
     progress: bool = True,
     trust: bool = False,
+    skip_damaged: bool = False,
 ) -> Outcome:
     """Resume a run from its last checkpoint.
 
@@ -121,6 +122,8 @@ def resume(
         callbacks: called while it trains. The loggers of the run's config log again by themselves.
         progress: see `train`.
         trust: see `evaluate`.
+        skip_damaged: if parts of the replay are damaged, leave out their episodes, with a warning,
+            instead of raising an error.
 
     Returns:
         As `train`. The outcome of a run that has ended already has no evaluation.
@@ -130,7 +133,9 @@ def resume(
     """
     opened = Run.open(Path(run)).with_agent(trusted=trust)
     asked = resume_request(opened.config, steps, minutes, device)
-    return _resume(opened, asked, callbacks, progress, env, trusted=trust)
+    return _resume(
+        opened, asked, callbacks, progress, env, trusted=trust, skip_damaged=skip_damaged
+    )
 
 
 def evaluate(
@@ -178,15 +183,16 @@ def _resume(
     progress: bool,
     make: MakeEnv | None,
     *,
-    trusted: bool,
+    trusted: bool = False,
+    skip_damaged: bool = False,
 ) -> Outcome:
     """Resume a run with a config; return the outcome of a run that has ended as it is."""
     imports = make is None
     with resumption(run, asked, ["device"], imports=imports, trusted=trusted) as found:
         if found.done is not None:
             return found.done
-        resumed = found.run, found.start
-        return _fit(found.config, callbacks, progress, make=make, resumed=resumed)
+        options = {"resumed": (found.run, found.start), "skip_damaged": skip_damaged}
+        return _fit(found.config, callbacks, progress, make=make, **options)
 
 
 def _fit(

@@ -143,6 +143,7 @@ def test_evaluating_a_hostile_folder_imports_nothing_from_it(run: Path, tmp_path
     folder = tmp_path / "hostile"
     shutil.copytree(run, folder)
     record = json.loads((folder / "config.json").read_text())
+    del record["checksum"]
     record["module_folders"] = {"reach_duplo": str(folder)}
     (folder / "config.json").write_text(json.dumps(record))
     for name in ("dm_control", "mujoco", "warp", "torch", "av", "rich", "sitecustomize"):
@@ -642,6 +643,7 @@ def test_a_damaged_config_is_reported_in_one_line(  # type: ignore[no-untyped-de
 ) -> None:
     (tmp_path / "run").mkdir()
     record = json.loads((run / "config.json").read_text())
+    del record["checksum"]
     damage(record)
     (tmp_path / "run" / "config.json").write_text(json.dumps(record))
     for command in ("evaluate", "resume"):
@@ -680,6 +682,7 @@ def test_an_incomplete_state_is_reported_in_one_line(
         file, manifest = checkpoint / "state.json", checkpoint / "manifest.json"
         file.write_text(json.dumps(state))
         content = json.loads(manifest.read_text())
+        del content["checksum"]
         content["files"]["state.json"] = {
             "bytes": file.stat().st_size,
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),

@@ -219,6 +219,7 @@ def test_device_auto_replaces_a_recorded_device_that_is_missing(
     folder = tmp_path / "run"
     shutil.copytree(trained_runs["given"], folder)
     record = json.loads((folder / "config.json").read_text())
+    del record["checksum"]
     record["config"]["device"] = "cuda"
     (folder / "config.json").write_text(json.dumps(record))
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)

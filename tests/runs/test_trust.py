@@ -108,6 +108,7 @@ def plant(path: Path) -> None:
 
 def edit(run: Path, change: Callable[[dict[str, Any]], object]) -> None:
     record = json.loads((run / "config.json").read_text())
+    record.pop("checksum", None)
     change(record)
     (run / "config.json").write_text(json.dumps(record))
 

@@ -33,6 +33,7 @@ COMMANDS = {
     "demos": "record demonstrations, from which a run can learn",
     "sweep": "run the experiments of the paper, or your own",
     "report": "draw and compare learning curves",
+    "check": "find damaged files in a run",
     "compare": "print what differs between two runs",
     "tasks": "list the tasks, with an image of each",
     "info": "show versions, hardware and the expected speed",

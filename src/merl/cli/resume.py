@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from merl.cli.parsing import RunOptions, parse
-from merl.cli.running import go_on, tell_trusted
+from merl.cli.running import Damaged, go_on, tell_trusted
 from merl.config import Device
 from merl.core.fields import Range
 from merl.runs.resume import resume_request
@@ -23,6 +23,8 @@ class ResumeOptions(RunOptions):
     """Stop after this many minutes from now; by default there is no time limit."""
     device: Device | None = None
     """Where the networks live from now on; by default where they were before."""
+    damaged: Damaged = "refuse"
+    """If a part of the replay is damaged: do not resume, or skip the episodes with damage."""
 
 
 def resume(args: list[str]) -> int:
@@ -33,4 +35,5 @@ def resume(args: list[str]) -> int:
         tell_trusted(run)
     run = run.with_agent(trusted=options.trust)
     asked = resume_request(run.config, options.steps, options.minutes, options.device)
-    return go_on(run, asked, ["device"], trusted=options.trust)
+    skip = options.damaged == "skip"
+    return go_on(run, asked, ["device"], trusted=options.trust, skip_damaged=skip)

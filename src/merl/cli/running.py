@@ -6,6 +6,7 @@ import sys
 from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 from rich.filesize import decimal
@@ -28,6 +29,8 @@ from merl.training.setup import Setup
 from merl.training.trainer import Trainer
 
 DAY = 86_400.0  # seconds
+Damaged = Literal["refuse", "skip"]
+"""What to do with a replay of which a part is damaged."""
 
 
 def begin(config: TrainConfig, source: Source, what: str) -> int:
@@ -52,13 +55,18 @@ def go_on(
     *,
     trusted: bool = False,
     named_in: Path | None = None,
+    skip_damaged: bool = False,
 ) -> int:
-    """Resume a run and train it to its end; return the exit code. See `resumption`."""
+    """Resume a run and train it to its end; return the exit code.
+
+    See `resumption`, and `Trainer` for `skip_damaged`.
+    """
     with resumption(run, asked, given_open, trusted=trusted, named_in=named_in) as found:
         if found.done is not None:
             print(found.what)
             return 0
-        return _train(found.config, found.what, (found.run, found.start))
+        resumed = found.run, found.start
+        return _train(found.config, found.what, resumed, CUSTOM, skip_damaged)
 
 
 def tell_trusted(run: Run) -> None:
@@ -73,11 +81,12 @@ def _train(
     what: str,
     resumed: tuple[Run, Checkpoint | None] | None = None,
     source: Source = CUSTOM,
+    skip_damaged: bool = False,
 ) -> int:
     """Train, print the result, and return the exit code."""
     console = make_console()
     try:
-        outcome = _fit(config, what, resumed, source, console)
+        outcome = _fit(config, what, resumed, source, skip_damaged, console)
     except KeyboardInterrupt:  # during training, `Interrupt` defers signals
         console.print("stopped before training began: nothing was written")
         raise
@@ -102,13 +111,17 @@ def _fit(
     what: str,
     resumed: tuple[Run, Checkpoint | None] | None,
     source: Source,
+    skip_damaged: bool,
     console: Console,
 ) -> Outcome:
     """Train with the live view; the trainer and the files that it maps are gone at the end."""
     with ExitStack() as stack:
         view = LiveView(console, _scale(config))
         with console.status("building the scene and timing this machine", spinner="line"):
-            trainer = stack.enter_context(Trainer(config, [view], source=source, resumed=resumed))
+            trainer = Trainer(
+                config, [view], source=source, resumed=resumed, skip_damaged=skip_damaged
+            )
+            stack.enter_context(trainer)
         done = resumed[1].step if resumed and resumed[1] else 0
         console.print(_outlook(trainer.setup, what, done), highlight=False)
         seconds = trainer.setup.timing.seconds(trainer.config)

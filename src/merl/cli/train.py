@@ -13,7 +13,7 @@ import tyro
 from merl.agents import AGENTS
 from merl.agents.config import ObservationConfig
 from merl.cli.parsing import parse
-from merl.cli.running import begin, go_on
+from merl.cli.running import Damaged, begin, go_on
 from merl.config import Setting, Source, TrainConfig, flat
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.cloning import starts_cloned
@@ -49,6 +49,9 @@ class TrainOptions:
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Resume the run in --run-dir if there is one, else start it. A job that may be stopped at any
     time can be submitted again with the same command."""
+    damaged: Damaged = "refuse"
+    """With --resume, if a part of the replay is damaged: do not resume, or skip the episodes with
+    damage."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,8 @@ def train(args: list[str]) -> int:
             run = Run.open(config.run_dir)
             if run.config.agent_name == config.agent_name:  # otherwise `go_on` refuses
                 run = run.with_agent(named_in=Path.cwd())
-            asked = starts_cloned(config, run)
-            return go_on(run, asked, given_open, named_in=Path.cwd())
+            asked, skip = starts_cloned(config, run), chosen.damaged == "skip"
+            return go_on(run, asked, given_open, named_in=Path.cwd(), skip_damaged=skip)
     why = "CUDA is available" if preset == "paper" else "CUDA is not available"
     reason = why if first.preset is None else "as requested"
     return begin(config, source, f"preset {preset} ({reason}; {PRESETS[preset].about})")

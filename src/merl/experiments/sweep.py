@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
-import json
 import os
 import signal
 import subprocess
@@ -29,6 +28,7 @@ from merl.core import (
     METRICS_FILE,
     MerlError,
 )
+from merl.core.files import read_json
 from merl.core.signals import Interrupt
 from merl.experiments.experiment import PlannedRun
 from merl.runs.resume import left_open
@@ -102,7 +102,7 @@ def is_done(run: PlannedRun, episodes: int) -> bool:
 def evaluation_of(folder: Path) -> dict[str, Any] | None:
     """Return the evaluation at the end of a run; None if there is none or it cannot be read."""
     try:
-        evaluated: dict[str, Any] = json.loads((folder / EVALUATION_FILE).read_text())
+        evaluated: dict[str, Any] = read_json(folder / EVALUATION_FILE)
         return evaluated if isinstance(evaluated["step"], int) and evaluated["episodes"] else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
+from merl.core.files import open_file, read_file
 from merl.replay.spec import Field
 
 STAGES = (1, 5, 25)
@@ -31,8 +33,8 @@ class Backgrounds:
     def __init__(self, field: Field, file: Path | None) -> None:
         self._field, self._file = field, file
         self._first: list[NDArray[Any]] = []
-        if file is not None and file.exists():
-            raw = file.read_bytes()
+        if file is not None:
+            raw = _content(file, field)
             for end in range(field.bytes, len(raw) + 1, field.bytes):
                 self._first.append(np.frombuffer(raw[end - field.bytes : end], field.dtype))
         self._made = self._medians()
@@ -64,13 +66,27 @@ class Backgrounds:
         if self.frames in STAGES:
             self._made.append(self._median(self.frames))
 
-    def check(self, frames: int) -> None:
-        """Raise MerlError if there are fewer than `frames` first frames: decoding needs them."""
+    def check(self, frames: int, sum_: int | None = None) -> None:
+        """Raise MerlError if first frames are missing or damaged: decoding needs them.
+
+        Args:
+            frames: number of first frames.
+            sum_: their `checksum`; None if it is not known.
+        """
         if frames > self.frames:
-            raise MerlError(
-                f"{self._file} holds {self.frames} of the {frames} images that decode the replay's "
-                "images: restore the complete run folder, or start a new run"
-            )
+            problem = f"holds {self.frames} of the {frames} images that decode"
+        elif sum_ is not None and sum_ != self.checksum(frames):
+            problem = "is damaged, and its images decode"
+        else:
+            return
+        raise MerlError(
+            f"{self._file} {problem} the replay's images: restore the complete run folder, or "
+            "start a new run"
+        )
+
+    def checksum(self, frames: int) -> int:
+        """Return the CRC-32 of the first `frames` first frames."""
+        return zlib.crc32(b"".join(frame.tobytes() for frame in self._first[:frames]))
 
     def truncate(self, frames: int) -> None:
         """Keep the backgrounds of the first `frames` frames, and discard all newer ones."""
@@ -88,9 +104,23 @@ class Backgrounds:
         return median.astype(self._field.dtype)
 
 
+def _content(path: Path, field: Field) -> bytes:
+    """Return the content of the file of the first frames; nothing if there is none.
+
+    Raises:
+        MerlError: it cannot be read.
+    """
+    try:
+        return read_file(path, most=(STAGES[-1] + 1) * field.bytes)
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise MerlError(f"{path} cannot be read: {error.strerror}") from None
+
+
 def _append(path: Path, frame: NDArray[Any], at: int) -> None:
     """Write a frame to the disk, before any frame depends on the background made from it."""
-    with path.open("ab") as file:
+    with open_file(path, "ab") as file:
         file.truncate(at)  # remove an incomplete frame
         file.write(frame.tobytes())
         file.flush()

@@ -18,17 +18,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from merl.core import Batch, FrameTransforms, Observation, Transition
+from merl.core import Batch, FrameTransforms, MerlError, Observation, Transition
 from merl.replay.capacity import check_fits
 from merl.replay.compression import CompressedFrames
+from merl.replay.damage import JOURNAL, find_damage
 from merl.replay.frames import RawFrames, ReadAhead, copy_stacks, copy_unchanged
 from merl.replay.journal import Journal
 from merl.replay.ring import EpisodeRing
 from merl.replay.sampling import SampleIndices, Sampler
 from merl.replay.spec import ReplaySpec, field_name, span_name
 from merl.replay.storage import Storage, in_memory, new_files, open_files
-
-_JOURNAL = "overwritten.journal"
 
 
 class ReplayBuffer:
@@ -75,7 +74,7 @@ class ReplayBuffer:
             for key, spec in self.spec.keys.items()
             if spec.stacked
         }
-        self._journal = None if folder is None else Journal(folder / _JOURNAL, arrays)
+        self._journal = None if folder is None else Journal(folder / JOURNAL, arrays)
         self.rings = [
             EpisodeRing(number, self.spec, storage, self._compressed, self._journal)
             for number in range(self.spec.rings)
@@ -158,11 +157,13 @@ class ReplayBuffer:
         self._storage.flush()
 
     def confirm_checkpoint(self) -> None:
-        """Confirm that a checkpoint of this state is on disk: older states are not needed."""
-        for ring in self.rings:
-            ring.confirm_checkpoint()
-        if self._journal is not None:
-            self._journal.empty()
+        """Confirm that a checkpoint of this state is on disk.
+
+        Of older states only the one that was confirmed before it can still be restored.
+        """
+        changed = [ring.confirm_checkpoint() for ring in self.rings]
+        if self._journal is not None and any(changed):
+            self._journal.begin_anew()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the counts that locate the data, as plain numbers; the data stays in the rings."""
@@ -172,24 +173,55 @@ class ReplayBuffer:
             "starts": {key: each.backgrounds.frames for key, each in self._compressed.items()},
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def checksums(self) -> dict[str, Any]:
+        """Return checksums of the data: with them in a state, `load_state_dict` finds damage."""
+        backgrounds = {key: each.backgrounds for key, each in self._compressed.items()}
+        return {
+            "covered": [ring.covered() for ring in self.rings],
+            "start_sums": {key: each.checksum(each.frames) for key, each in backgrounds.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any], *, skip_damaged: bool = False) -> None:
         """Restore from `state_dict()`, and discard everything written since then.
 
+        If the state also has `checksums()`, data on disk is compared with them first.
+
         Timesteps that were overwritten since then are restored, if the state is that of the last
-        confirmed checkpoint. If a ring has overwritten the state's own timestep and cannot restore
-        it (the disk was full, or the state is older), it keeps its newer steps, with a warning:
-        they are from the same run. Files that are too small for the capacity are replaced.
+        confirmed checkpoint or of the one before it. If a ring has overwritten the state's own
+        timestep and cannot restore it (the disk was full, or the state is older), it keeps its
+        newer steps, with a warning: they are from the same run. Files that are too small for the
+        capacity are replaced.
+
+        Args:
+            state: the state.
+            skip_damaged: leave out the episodes of damaged data, with a warning.
 
         Raises:
-            MerlError: a ring holds neither the state's timestep nor a newer one, or larger files
-                cannot be written.
+            MerlError: data is damaged, and nothing was changed; or a ring holds neither the state's
+                timestep nor a newer one, or larger files cannot be written.
         """
-        for key, frames in state["starts"].items():
-            self._compressed[key].backgrounds.check(int(frames))
+        damage = []
+        if self._directory is not None:
+            damage = find_damage(self._directory, self.spec, state)
+        if damage and not skip_damaged:
+            others = f", and {len(damage) - 1:,} other blocks are" if len(damage) > 1 else ""
+            raise MerlError(
+                f"{damage[0]}{others}: restore the file from a copy, or leave out the episodes of "
+                "damaged blocks with --damaged skip"
+            )
         pairs = list(zip(self.rings, state["rings"], strict=True))
         if self._journal is not None:
             self._journal.undo([int(ring_state["timesteps"]) for _, ring_state in pairs])
-        exact = [ring.load_state_dict(ring_state) for ring, ring_state in pairs]
+        exact = [
+            ring.load_state_dict(
+                ring_state, covered, [each for each in damage if each.ring == ring.number]
+            )
+            for (ring, ring_state), covered in zip(
+                pairs, state.get("covered", [None] * len(pairs)), strict=True
+            )
+        ]
+        if damage and not len(self):
+            raise MerlError(f"the replay in {self._directory} holds no step without damage")
         if all(exact):
             for key, frames in state["starts"].items():
                 self._compressed[key].backgrounds.truncate(int(frames))
@@ -203,6 +235,8 @@ class ReplayBuffer:
             self._use(storage)
             for ring, shorter in zip(self.rings, rings, strict=True):
                 ring.copy_from(shorter)
+        if self._journal is not None:
+            self._journal.forget_former()
 
     def _draw(self, batch_size: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Return ring, first timestep, and the ring's newest timestep of each sample."""

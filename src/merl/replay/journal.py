@@ -1,24 +1,29 @@
-"""Journal of the bytes that were overwritten since the last checkpoint, for exact resuming.
+"""Journal of the bytes that were overwritten since the last two checkpoints, for exact resuming.
 
 The time between two checkpoints is limited in seconds, not in steps, and a save can fail, so no
 number of spare slots could keep everything that the last checkpoint needs. So the bytes of a
-timestep are copied into the journal before they are overwritten.
+timestep are copied into the journal before they are overwritten. A new checkpoint begins a new
+file and keeps the former one, from which the checkpoint before it can be restored, too.
 """
 
 from __future__ import annotations
 
 import logging
+import mmap
+import os
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
+from merl.core.files import open_file
 
 _HEAD = struct.Struct("<5q")  # ring, timestep, index of the array, first byte, number of bytes
+_FORMER = ".former"
 _LOG = logging.getLogger(__name__)
 
 
@@ -34,12 +39,13 @@ class Journal:
     """
 
     def __init__(self, path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+        self._path = path
         self._index = {name: index for index, name in enumerate(arrays)}
-        self._arrays = [array.reshape(-1).view(np.uint8) for array in arrays.values()]
+        self._arrays = as_bytes(arrays)
         self._is_complete = True
         try:
             # Unbuffered: written data survives if the process is killed.
-            self._file = path.open("a+b", buffering=0)
+            self._file = open_file(path, "a+b", buffering=0)
         except OSError as error:
             raise MerlError(f"cannot store a replay in {path.parent}: {error.strerror}") from None
 
@@ -68,7 +74,7 @@ class Journal:
         except OSError as error:
             whole, reason = False, error.strerror or str(error)
         if not whole:
-            self.empty()
+            self._file.truncate(0)
             self._is_complete = False
             _LOG.warning(
                 "cannot write the replay's journal: %s; until the next checkpoint, resuming loses "
@@ -77,23 +83,96 @@ class Journal:
             )
 
     def undo(self, timesteps: Sequence[int]) -> None:
-        """Restore the bytes that later timesteps than `timesteps`, one per ring, overwrote."""
-        for ring, timestep, index, begin, old in reversed(list(self._records())):
-            if timestep > timesteps[ring]:
-                self._arrays[index][begin : begin + len(old)] = np.frombuffer(old, np.uint8)
-        self.empty()
+        """Restore the bytes that later timesteps than `timesteps`, one per ring, overwrote.
 
-    def empty(self) -> None:
-        """Remove all records: the replay is in the state of the last checkpoint."""
-        self._file.truncate(0)
+        The records of these bytes are removed.
+
+        Raises:
+            MerlError: the journal cannot be read.
+        """
+        for file, end in undo_into(self._arrays, self._path, timesteps).items():
+            os.truncate(file, end)
         self._is_complete = True
 
-    def _records(self) -> Iterator[tuple[int, int, int, int, memoryview]]:
-        """Yield all records, except one that is incomplete because the process died."""
-        self._file.seek(0)
-        raw, at = memoryview(self._file.read()), 0
-        while at + _HEAD.size <= len(raw):
-            ring, timestep, index, begin, count = _HEAD.unpack_from(raw, at)
-            at += _HEAD.size + count
-            if at <= len(raw):
-                yield ring, timestep, index, begin, raw[at - count : at]
+    def begin_anew(self) -> None:
+        """Begin new records after a checkpoint, and keep those since the checkpoint before it."""
+        self._is_complete = True
+        try:
+            self._path.replace(self._path.with_suffix(_FORMER))
+            file = open_file(self._path, "a+b", buffering=0)
+        except OSError:  # the folder cannot be written any more
+            self._file.truncate(0)
+        else:
+            self._file.close()
+            self._file = file
+
+    def forget_former(self) -> None:
+        """Remove the records for the checkpoint before the last: the arrays have moved."""
+        self._path.with_suffix(_FORMER).unlink(missing_ok=True)
+
+
+class _Record(NamedTuple):
+    """Overwritten bytes: `old` from byte `begin` of an array; `end`: where the record ends."""
+
+    ring: int
+    timestep: int
+    array: int
+    begin: int
+    old: memoryview
+    end: int
+
+
+def as_bytes(arrays: Mapping[str, NDArray[Any]]) -> list[NDArray[np.uint8]]:
+    """Return the bytes of each array, without a copy."""
+    return [array.reshape(-1).view(np.uint8) for array in arrays.values()]
+
+
+def undo_into(
+    arrays: Sequence[NDArray[np.uint8]], path: Path, timesteps: Sequence[int]
+) -> dict[Path, int]:
+    """Restore bytes of arrays from a journal; see `Journal.undo`.
+
+    Args:
+        arrays: the bytes of each array of the replay.
+        path: file of the journal; the former one is beside it.
+        timesteps: the newest timestep of each ring that is not undone.
+
+    Returns:
+        For each file, the end of its records that are still needed.
+
+    Raises:
+        MerlError: a file cannot be read.
+    """
+    ends = {}
+    for file in (path, path.with_suffix(_FORMER)):
+        try:
+            records = list(_records(file, arrays, len(timesteps)))
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise MerlError(f"{file} cannot be read: {error.strerror}") from None
+        later = [each for each in records if each.timestep > timesteps[each.ring]]
+        ends[file] = max((each.end for each in records[: len(records) - len(later)]), default=0)
+        for each in reversed(later):
+            arrays[each.array][each.begin : each.begin + len(each.old)] = np.frombuffer(
+                each.old, np.uint8
+            )
+    return ends
+
+
+def _records(path: Path, arrays: Sequence[NDArray[np.uint8]], rings: int) -> Iterator[_Record]:
+    """Yield all records, except one that is incomplete because the process died."""
+    with open_file(path) as file:
+        if not os.fstat(file.fileno()).st_size:
+            return
+        raw = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    at = 0
+    while at + _HEAD.size <= len(raw):
+        ring, timestep, index, begin, count = _HEAD.unpack_from(raw, at)
+        place = range(arrays[index].size) if 0 <= index < len(arrays) else range(0)
+        if not (0 <= ring < rings and timestep > 0 and 0 <= begin <= begin + count <= len(place)):
+            _LOG.warning("%s is damaged from byte %s on: the rest is not used", path, f"{at:,}")
+            return
+        at += _HEAD.size + count
+        if at <= len(raw):
+            yield _Record(ring, timestep, index, begin, raw[at - count : at], at)

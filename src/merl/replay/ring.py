@@ -12,14 +12,16 @@ are numbered 1, 2, 3, ...; timestep i is in slot (i - 1) mod slots.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.core import MerlError, Observation, Transition
+from merl.core import MerlError, Observation, Transition, counted
+from merl.replay.checksums import Checksums, Covered, RingData
 from merl.replay.compression import ByteRing, CompressedFrames
+from merl.replay.damage import Damage, leave_out
 from merl.replay.journal import Journal
 from merl.replay.spec import ReplaySpec, field_name
 from merl.replay.storage import Storage
@@ -44,6 +46,7 @@ class EpisodeRing:
         journal: records what is overwritten; None: nothing does.
 
     Attributes:
+        number: number of the ring.
         timesteps: number of timesteps ever written, which is the number of the newest one.
         steps: number of steps ever written.
         first: the oldest step that can be sampled; steps are numbered 0, 1, 2, ...
@@ -59,8 +62,10 @@ class EpisodeRing:
         frames: Mapping[str, CompressedFrames],
         journal: Journal | None,
     ) -> None:
-        self._number, self._spec, self._capacity = number, spec, spec.ring_capacity
+        self.number, self._spec, self._capacity = number, spec, spec.ring_capacity
         self._slots, self._base = storage.slots, number * storage.slots
+        self._all = RingData(spec, storage.arrays, number, storage.slots)
+        self._checksums = Checksums(self._all)
         self._frames, self._journal = frames, journal
         self._data = {
             name: array[self._base : self._base + self._slots]
@@ -117,24 +122,46 @@ class EpisodeRing:
         self._forget()
         self.in_progress = not transition.last
 
-    def confirm_checkpoint(self) -> None:
-        """Confirm that a checkpoint of this state is on disk."""
-        self._confirmed = self.timesteps
+    def confirm_checkpoint(self) -> bool:
+        """Confirm that a checkpoint of this state is on disk; return whether it is a new state."""
+        changed, self._confirmed = self._confirmed != self.timesteps, self.timesteps
+        return changed
 
     def state_dict(self) -> dict[str, Any]:
         """Return the counts that locate the data, as plain numbers."""
         return {"timesteps": self.timesteps, "steps": self.steps, "open": self.in_progress}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> bool:
+    def covered(self) -> Covered:
+        """Return which timesteps a checkpoint of this state covers, and their checksums."""
+        sums = self._checksums.update(self._oldest, self.timesteps)
+        return {"oldest": self._oldest, "newest": self.timesteps, "first": self.first, "sums": sums}
+
+    def load_state_dict(
+        self,
+        state: Mapping[str, Any],
+        covered: Covered | None = None,
+        damage: Sequence[Damage] = (),
+    ) -> bool:
         """Restore from `state_dict()`; see `ReplayBuffer.load_state_dict`.
+
+        Args:
+            state: the state.
+            covered: from `covered()` of this state, if it is known.
+            damage: the damage in the ring; its episodes are left out, with a warning.
 
         Returns:
             Whether the state is restored; else the ring keeps its newer timesteps.
         """
         timesteps = int(state["timesteps"])
+        self._checksums = Checksums(self._all)
+        if covered is not None and damage:
+            self._leave_out(covered, damage)
         if timesteps == 0 or self._data["timestep"][self._slot(timesteps)] == timesteps:
-            self._rebuild(timesteps, int(state["steps"]), bool(state["open"]))
+            oldest = covered["oldest"] if covered else 1
+            self._rebuild(timesteps, int(state["steps"]), bool(state["open"]), oldest)
             self._confirmed = timesteps
+            if covered is not None and not damage:
+                self._continue(covered)
             return True
         newest = self._newest()
         if newest <= timesteps:
@@ -150,6 +177,26 @@ class EpisodeRing:
             f"{len(self):,}",
         )
         return False
+
+    def _leave_out(self, covered: Covered, damage: Sequence[Damage]) -> None:
+        episodes, timesteps = leave_out(self._all, covered, damage)
+        _LOG.warning(
+            "%s of environment %s (%s) are left out of the replay, because of damage: training "
+            "continues, but not bit-exactly",
+            counted(episodes, "episode"),
+            self.number,
+            counted(timesteps, "timestep"),
+        )
+
+    def _continue(self, covered: Covered) -> None:
+        """Continue with checksums that were found to be right."""
+        self._checksums.adopt(covered)
+        if self.first > covered["first"]:
+            _LOG.warning(
+                "the replay has overwritten %s of the checkpoint: training continues without them, "
+                "and not bit-exactly",
+                counted(self.first - covered["first"], "step"),
+            )
 
     def copy_from(self, other: EpisodeRing) -> None:
         """Copy the timesteps of a shorter ring."""
@@ -224,7 +271,7 @@ class EpisodeRing:
         sizes = {name: self._spec.fields[name].bytes for name in self._data}
         ranges = [(name, row * size, size) for name, size in sizes.items()]
         ranges += [(field_name(key), *frames.span(row)) for key, frames in self._frames.items()]
-        self._journal.keep(self._number, timestep, ranges)
+        self._journal.keep(self.number, timestep, ranges)
 
     def _warn_of_fewer_steps(self) -> None:
         """Warn, once, that frames fill the reserved bytes before the capacity is reached."""
@@ -247,17 +294,24 @@ class EpisodeRing:
                 break
             self.first += 1
 
-    def _rebuild(self, timesteps: int, steps: int | None = None, in_progress: bool = False) -> None:
+    def _rebuild(
+        self,
+        timesteps: int,
+        steps: int | None = None,
+        in_progress: bool = False,
+        oldest: int = 1,
+    ) -> None:
         """Set the ring to timestep number `timesteps`, and find the steps that it holds up to it.
 
         Args:
             timesteps: number of timesteps ever written.
             steps: number of steps ever written; None: number of steps in the ring.
             in_progress: whether the episode of the last timestep continues.
+            oldest: the oldest timestep that the ring may hold.
         """
         stamps = self._data["timestep"]
         stamps[stamps > timesteps] = 0  # else a later opening would find them as newer timesteps
-        numbers = np.arange(max(0, timesteps - self._slots) + 1, timesteps + 1)
+        numbers = np.arange(max(timesteps - self._slots + 1, oldest), timesteps + 1)
         slots = self._slot(numbers)
         missing = numbers[stamps[slots] != numbers]  # overwritten, or only half written
         self._oldest = int(missing[-1] if missing.size else timesteps - len(numbers)) + 1

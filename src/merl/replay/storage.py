@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
+from merl.core.files import check_kind, open_file, read_json
 from merl.core.resources import reserve_file
 from merl.replay.spec import ReplaySpec
 
@@ -63,14 +64,48 @@ def open_files(directory: Path, spec: ReplaySpec) -> Storage:
     Raises:
         MerlError: see `new_files`; or the directory holds another replay or a damaged one.
     """
-    folders = [path for path in directory.glob("*") if path.name.isdecimal()]
-    if not folders:
+    folder = folder_in(directory)
+    if folder is None:
         with new_files(directory, spec) as storage:
             return storage
-    folder = max(folders, key=lambda path: int(path.name))
     _check(folder, spec)
     _remove_others(folder)
     return _mapped(folder, spec, int(folder.name))
+
+
+def open_copy(directory: Path, spec: ReplaySpec) -> Storage:
+    """Open the files of an existing replay; changes stay in memory and leave the files unchanged.
+
+    Raises:
+        MerlError: there is no replay, or another one, or a damaged one.
+    """
+    folder = folder_in(directory)
+    if folder is None:
+        raise MerlError(f"{directory} holds no replay")
+    _check(folder, spec)
+    return _mapped(folder, spec, int(folder.name), mmap.ACCESS_COPY)
+
+
+def holds_steps(directory: Path) -> bool:
+    """Return whether a folder holds a replay with a timestep.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    folder = folder_in(directory)
+    if folder is None:
+        return False
+    with open_file(folder / "timestep.bin") as file:
+        while chunk := file.read(1 << 20):
+            if any(chunk):
+                return True
+    return False
+
+
+def folder_in(directory: Path) -> Path | None:
+    """Return the folder of an existing replay, the largest; None if there is none."""
+    folders = [path for path in directory.glob("*") if path.name.isdecimal()]
+    return max(folders, key=lambda path: int(path.name), default=None)
 
 
 @contextmanager
@@ -108,11 +143,13 @@ def new_files(directory: Path, spec: ReplaySpec) -> Iterator[Storage]:
     _remove_others(directory / str(spec.slots))
 
 
-def _mapped(folder: Path, spec: ReplaySpec, slots: int) -> Storage:
+def _mapped(folder: Path, spec: ReplaySpec, slots: int, access: int = mmap.ACCESS_WRITE) -> Storage:
     files, arrays = {}, {}
+    mode = "r+b" if access == mmap.ACCESS_WRITE else "rb"
     for name, field in spec.fields.items():
-        with (folder / f"{name}.bin").open("r+b") as file:
-            files[name] = mmap.mmap(file.fileno(), spec.rings * slots * field.bytes)
+        size = spec.rings * slots * field.bytes
+        with open_file(folder / f"{name}.bin", mode) as file:
+            files[name] = mmap.mmap(file.fileno(), size, access=access)
         arrays[name] = np.frombuffer(files[name], field.dtype).reshape(-1, *field.shape)
     return Storage(slots, arrays, files)
 
@@ -128,19 +165,31 @@ def _check(folder: Path, spec: ReplaySpec) -> None:
     """Raise MerlError if the replay in the folder has other fields or is damaged."""
     directory, rows = folder.parent, spec.rings * int(folder.name)
     try:
-        same = json.loads((folder / _HEADER).read_text()) == _described(spec)
-        whole = not same or all(
-            (folder / f"{name}.bin").stat().st_size == rows * field.bytes > 0
-            for name, field in spec.fields.items()
-        )
-    except (OSError, ValueError, RecursionError) as error:
-        raise MerlError(f"{directory} holds a damaged replay: use another folder") from error
+        same = read_json(folder / _HEADER) == _described(spec)
+    except (OSError, ValueError) as error:
+        raise MerlError(
+            f"{directory} holds a damaged replay ({_HEADER}: {_reason(error)}): use another folder"
+        ) from error
     if not same:
         raise MerlError(
-            f"{directory} holds a replay of other observations or actions: use another folder"
+            f"{directory} holds a replay of other observations or actions ({folder / _HEADER}): "
+            "use another folder"
         )
-    if not whole:
-        raise MerlError(f"{directory} holds a truncated replay: use another folder")
+    for name, field in spec.fields.items():
+        file = folder / f"{name}.bin"
+        try:
+            check_kind(file)
+            size = file.stat().st_size
+        except OSError as error:
+            raise MerlError(
+                f"{directory} holds a damaged replay ({file}: {_reason(error)}): use another folder"
+            ) from error
+        if size != rows * field.bytes or not size:
+            raise MerlError(f"{directory} holds a truncated replay ({file}): use another folder")
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def _described(spec: ReplaySpec) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from merl.core import (
     METRICS_FILE,
     MerlError,
 )
+from merl.core.files import open_file, read_json
 from merl.envs.config import EnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.report.curves import Array, Curve, curve_of, read_metrics
@@ -298,7 +299,7 @@ def _about_seeds(groups: Sequence[Group]) -> Iterator[str]:
 def _json(path: Path) -> dict[str, Any]:
     """Return the object in a file; an empty one if it cannot be read."""
     try:
-        found = json.loads(path.read_bytes())
+        found = read_json(path)
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
@@ -307,7 +308,7 @@ def _json(path: Path) -> dict[str, Any]:
 def _locked(path: Path) -> bool:
     """Return whether a process trains the run."""
     try:
-        with path.open() as file:
+        with open_file(path) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             return False
     except BlockingIOError:

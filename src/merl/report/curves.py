@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import METRICS_FILE, MerlError
+from merl.core.files import read_file
 from merl.core.statistics import bootstrap_interval
 
 Array = NDArray[np.float64]
@@ -67,7 +68,7 @@ def read_metrics(run: Path | str) -> dict[str, Array]:
     path = Path(run)
     path = path / METRICS_FILE if path.is_dir() else path
     try:
-        text = path.read_bytes()
+        text = read_file(path)
     except OSError as error:
         raise MerlError(f"no metrics in {path}: {error.strerror}") from None
     try:

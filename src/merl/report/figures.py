@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError
+from merl.core.files import read_json
 from merl.report.curves import (
     Aggregate,
     Array,
@@ -326,7 +326,7 @@ def _title(run_dir: Run) -> str:
     """
     path = Path(run_dir)
     try:
-        config: Any = json.loads((path / CONFIG_FILE).read_text())
+        config: Any = read_json(path / CONFIG_FILE)
     except (OSError, ValueError):
         config = {}
     config = config if isinstance(config, dict) else {}

@@ -16,10 +16,10 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError
@@ -27,6 +27,7 @@ from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
 
 from merl.core import Agent, MerlError
+from merl.core.files import open_file, read_json, sealed
 from merl.core.guards import check_weights
 from merl.networks.settings import torch_settings
 
@@ -34,7 +35,7 @@ FORMAT = 1
 _WEIGHTS, _LEARNER = "weights.safetensors", "learner.pt"
 _STATE, _MANIFEST = "state.json", "manifest.json"
 _FILES = (_WEIGHTS, _LEARNER, _STATE)
-_BAD_VALUES = (ValueError, TypeError, AttributeError, RecursionError)
+_BAD_VALUES = (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
 _CPU = torch.device("cpu")
 _LOG = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ class Checkpoint:
                 truncated or changed.
         """
         try:
-            manifest = json.loads((path / _MANIFEST).read_text())
+            manifest = read_json(path / _MANIFEST)
             files, number = manifest["files"], manifest["format"]
             step, score = int(manifest["step"]), manifest["score"]
             score = None if score is None else float(score)
@@ -71,7 +72,7 @@ class Checkpoint:
             missing = {*_FILES} - {*files.keys()}
             if missing:
                 raise ValueError(f"it does not list {', '.join(sorted(missing))}")
-        except (OSError, LookupError, ArithmeticError, *_BAD_VALUES) as error:
+        except (OSError, LookupError, *_BAD_VALUES) as error:
             raise MerlError(f"checkpoint {path} has no readable manifest ({error})") from None
         if number != FORMAT:
             raise MerlError(
@@ -80,8 +81,8 @@ class Checkpoint:
             )
         for name, expected in files.items():
             try:
-                whole = _fingerprint(path / name) == expected
-            except OSError:
+                whole = _fingerprint(path / name, expected["bytes"]) == expected
+            except (OSError, LookupError, TypeError):
                 whole = False
             if not whole:
                 raise MerlError(f"checkpoint {path}: {name} is missing or damaged")
@@ -101,13 +102,13 @@ class Checkpoint:
             MerlError: there is no such checkpoint, or the selected one is damaged.
         """
         if which not in ("latest", "best"):
-            named = {str(int(path.name)): path for path in _folders(root)}
+            named = {str(int(path.name)): path for path in folders(root)}
             if which not in named:
                 choices = ", ".join(["latest", "best", *named])
                 raise MerlError(f"checkpoint {which!r} does not exist: choose from {choices}")
             return cls.open(named[which])
         whole = []
-        for path in reversed(_folders(root)):
+        for path in reversed(folders(root)):
             try:
                 whole.append(cls.open(path))
             except MerlError as error:
@@ -127,7 +128,7 @@ class Checkpoint:
             MerlError: the file cannot be read or does not hold a dict.
         """
         with readable(self):
-            state: dict[str, Any] = json.loads((self.path / _STATE).read_text())
+            state: dict[str, Any] = read_json(self.path / _STATE)
             if not isinstance(state, dict):
                 raise TypeError(f"{_STATE} holds a {type(state).__name__}, not a dict")
         return state
@@ -167,14 +168,13 @@ def save(
     try:
         with torch_settings(_CPU):
             _write(part, weights, learnt, state)
-        names = (_WEIGHTS, _LEARNER, _STATE)
         manifest = {
             "format": FORMAT,
             "step": step,
             "score": score,
-            "files": {name: _fingerprint(part / name) for name in names},
+            "files": {name: _fingerprint(part / name) for name in _FILES},
         }
-        (part / _MANIFEST).write_text(json.dumps(manifest, indent=1))
+        (part / _MANIFEST).write_text(json.dumps(sealed(manifest), indent=1))
         for path in (*part.iterdir(), part):
             _sync(path)
         final = root / f"{step:08d}"
@@ -210,7 +210,7 @@ def load_policy_of(agent: Agent, checkpoint: Checkpoint) -> None:
     """Restore an agent's policy to act only; the checkpoint may come from another device.
 
     Raises:
-        MerlError: a file cannot be read, or does not match the agent.
+        MerlError: see `load_agent`.
     """
     with readable(checkpoint), torch_settings(_CPU):
         agent.load_policy(_weights(checkpoint))
@@ -229,13 +229,11 @@ def readable(checkpoint: Checkpoint) -> Iterator[None]:
         raise
     except (
         OSError,
+        LookupError,
+        MemoryError,
         RuntimeError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        RecursionError,
         SafetensorError,
+        *_BAD_VALUES,
     ) as error:
         why = " ".join(line.strip() for line in str(error).strip().split("\n")[:2])
         raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {why}") from None
@@ -297,12 +295,10 @@ def _write(
     (folder / _STATE).write_text(json.dumps(state))
 
 
-def _folders(root: Path) -> list[Path]:
+def folders(root: Path) -> list[Path]:
     """Return the folders of checkpoints in the order of their steps."""
-    if not root.is_dir():
-        return []
-    folders = [path for path in root.iterdir() if path.is_dir() and _is_number(path.name)]
-    return sorted(folders, key=lambda path: int(path.name))
+    found = [path for path in root.glob("*") if path.is_dir() and _is_number(path.name)]
+    return sorted(found, key=lambda path: int(path.name))
 
 
 def _is_number(name: str) -> bool:
@@ -315,27 +311,32 @@ def _prune(root: Path, step: int, keep: int) -> None:
     Checkpoints of later steps than `step` are deleted, too: they were skipped as damaged when the
     run resumed from an earlier one.
     """
-    folders = _folders(root)
-    past = [path for path in folders if int(path.name) <= step]
+    every = folders(root)
+    past = [path for path in every if int(path.name) <= step]
     scores = {path: score for path, score in _scores(past) if score is not None}
     best = max(scores, key=lambda path: scores[path]) if scores else None
     stale = [path for path in root.glob(".part-*") if path.is_dir()]
-    for path in [*stale, *(path for path in folders if path not in past), *past[:-keep]]:
-        if path != best:
-            shutil.rmtree(path, ignore_errors=True)
+    for path in [*stale, *(path for path in every if path not in past), *past[:-keep]]:
+        if path == best:
+            continue
+        if path not in stale:  # a process that dies here leaves no half of a checkpoint
+            with suppress(OSError):
+                path = path.rename(root / f".part-{path.name}-pruned")
+        shutil.rmtree(path, ignore_errors=True)
 
 
-def _scores(folders: list[Path]) -> Iterator[tuple[Path, float | None]]:
-    for path in folders:
+def _scores(paths: list[Path]) -> Iterator[tuple[Path, float | None]]:
+    for path in paths:
         try:
-            yield path, json.loads((path / _MANIFEST).read_text())["score"]
-        except (OSError, ValueError, KeyError):
+            yield path, read_json(path / _MANIFEST)["score"]
+        except (OSError, ValueError, LookupError, TypeError):
             yield path, None
 
 
-def _fingerprint(path: Path) -> dict[str, Any]:
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+def _fingerprint(path: Path, most: int | None = None) -> dict[str, Any]:
+    """Return size and SHA-256 of a file of at most `most` bytes."""
+    with open_file(path, most=most) as file:
+        digest = hashlib.file_digest(cast(io.BufferedReader, file), "sha256").hexdigest()
     return {"bytes": path.stat().st_size, "sha256": digest}
 
 

@@ -17,6 +17,7 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 from merl.core import METRICS_FILE, MerlError
+from merl.core.files import open_file, read_file
 
 _LOG = logging.getLogger(__name__)
 
@@ -147,7 +148,7 @@ class MetricsFile(AbstractContextManager["MetricsFile"]):
         """Write all rows to a temporary file, replace `metrics.csv` by it, and open it."""
         temporary = self._path.with_name(f".{self._path.name}.part")
         try:
-            with temporary.open("wb") as file:
+            with open_file(temporary, "wb") as file:
                 file.write(_csv_line(self._columns))
                 file.writelines(map(self._line, self._rows))
                 file.flush()
@@ -172,7 +173,7 @@ def read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     An incomplete last line is left out.
     """
     try:
-        text = path.read_bytes()
+        text = read_file(path)
     except FileNotFoundError:
         return ["step"], []
     except OSError as error:

@@ -18,6 +18,7 @@ from merl.agents import AGENTS
 from merl.agents.config import ObservationConfig, UnloadedConfig
 from merl.config import TrainConfig
 from merl.core import CONFIG_FILE, MerlError, check_choice
+from merl.core.files import open_file, read_json, sealed
 from merl.core.user_code import module_folder
 from merl.runs import trust
 from merl.runs.plain import box, describe, from_plain, to_plain, told
@@ -66,7 +67,7 @@ def read(folder: Path) -> dict[str, Any]:
     Raises:
         MerlError: its format is not that of this version.
     """
-    record: dict[str, Any] = json.loads((folder / CONFIG_FILE).read_text())
+    record: dict[str, Any] = read_json(folder / CONFIG_FILE)
     number = record["format"]
     if number != FORMAT:
         raise MerlError(f"it has format {number}, but this version of merl reads format {FORMAT}")
@@ -81,8 +82,8 @@ def write(folder: Path, record: Mapping[str, Any]) -> None:
     """
     part = folder / PART
     try:
-        with part.open("w") as file:
-            file.write(json.dumps(record, indent=1))
+        with open_file(part, "wb") as file:
+            file.write(json.dumps(sealed(record), indent=1).encode())
             file.flush()
             os.fsync(file.fileno())
         part.replace(folder / CONFIG_FILE)
@@ -154,9 +155,7 @@ def readable(folder: Path) -> Iterator[None]:
         raise MerlError(f"{folder} is not a run: it has no {CONFIG_FILE}{way}") from None
     except Exception as error:  # the file may come from anyone
         reason = str(error)
-        if isinstance(error, UnicodeDecodeError):
-            reason = "it is not a text file"
-        elif isinstance(error, KeyError):
+        if isinstance(error, KeyError):
             reason = f"it has no {error}"
         elif isinstance(error, OSError):
             reason = error.strerror or reason

@@ -19,7 +19,6 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from gymnasium import spaces
 
 from merl.agents import find_agent
@@ -28,7 +27,9 @@ from merl.agents.networks import user_encoders
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, user_code
 from merl.envs.user_env import imports_code, load_module
+from merl.replay.storage import holds_steps
 from merl.runs import record, trust
+from merl.runs.metrics import read_rows
 from merl.runs.plain import from_plain
 from merl.runs.provenance import machine
 from merl.runs.record import FORMAT, Bounds
@@ -250,9 +251,10 @@ class Run:
         """
         if any(path.name.isdecimal() for path in self.checkpoints.glob("*")):
             return False
-        metrics = self.path / METRICS_FILE
-        has_rows = metrics.exists() and metrics.read_bytes().count(b"\n") > 1
-        if has_rows or any(np.fromfile(f, "<i8").any() for f in self.replay.rglob("timestep.bin")):
+        try:
+            if read_rows(self.path / METRICS_FILE)[1] or holds_steps(self.replay):
+                return False
+        except (OSError, MerlError):  # damaged: it is not known to be empty
             return False
         for folder in (self.replay, self.checkpoints):
             shutil.rmtree(folder, ignore_errors=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from merl.config import Source, TrainConfig
 from merl.core import CONFIG_FILE, LOCK_FILE, METRICS_FILE, MerlError, suggest
+from merl.core.files import open_file, read_file
 
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
 """Folder of the trained policies that come with merl: run folders without a replay."""
@@ -178,9 +179,11 @@ def lock_folder(run: Path) -> Iterator[None]:
     path = run / LOCK_FILE
     with ExitStack() as stack:
         try:
-            file = stack.enter_context(path.open("a+"))
+            file = stack.enter_context(open_file(path, "a+b"))
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            same = os.path.sameopenfile(file.fileno(), stack.enter_context(path.open()).fileno())
+            same = os.path.sameopenfile(
+                file.fileno(), stack.enter_context(open_file(path)).fileno()
+            )
         except BlockingIOError:
             owner = f"process {_text(path)}" if _text(path) else "another process"
             raise MerlError(f"{owner} is training in {run}: stop it first") from None
@@ -198,7 +201,7 @@ def lock_folder(run: Path) -> Iterator[None]:
 
 def _text(path: Path) -> str:
     with suppress(OSError, UnicodeDecodeError):
-        return path.read_text().strip()
+        return read_file(path, most=20).decode().strip()
     return ""
 
 

@@ -78,7 +78,7 @@ class Saver:
         state = {
             "progress": dataclasses.asdict(progress),
             "randomness": setup.randomness.state_dict(),
-            "replay": self._replay.state_dict(),
+            "replay": self._replay.state_dict() | self._replay.checksums(),
             "environment": self._environment_states(),
             "seconds": self._clock.seconds(),
             "cpu_seconds": self._clock.cpu_seconds(),
@@ -108,11 +108,15 @@ class Saver:
         self._callbacks.on_checkpoint(progress.step)
         return True
 
-    def restore(self, start: Checkpoint) -> None:
+    def restore(self, start: Checkpoint, *, skip_damaged: bool = False) -> None:
         """Restore agent, progress, replay, random streams and environments from a checkpoint.
 
+        Args:
+            start: the checkpoint.
+            skip_damaged: leave out the episodes of damaged parts of the replay.
+
         Raises:
-            MerlError: the checkpoint cannot be used.
+            MerlError: the checkpoint cannot be used, or a part of the replay is damaged.
             EnvironmentsLost: an environment's process died.
         """
         setup, state = self._setup, start.state()
@@ -124,7 +128,7 @@ class Saver:
                     raise TypeError(f"progress is {counts}")
                 setup.progress = Progress(**counts)
                 setup.randomness.load_state_dict(state["randomness"])
-                self._replay.load_state_dict(state["replay"])
+                self._replay.load_state_dict(state["replay"], skip_damaged=skip_damaged)
                 states = state["environment"]
                 self._states = states if isinstance(states, list) else [states]
                 self._environments.restore(self._states)

@@ -51,6 +51,7 @@ class Trainer:
         source: where the config's values come from; recorded with a new run.
         resumed: None for a new run; else the run to resume, whose lock the caller holds, and the
             checkpoint to resume from, or None to start at the first step.
+        skip_damaged: see `Saver.restore`.
         make: makes the environment, if the config does not name it; see `make_run_env`.
 
     Attributes:
@@ -78,6 +79,7 @@ class Trainer:
         *,
         source: Source = CUSTOM,
         resumed: tuple[Run, Checkpoint | None] | None = None,
+        skip_damaged: bool = False,
         make: MakeEnv | None = None,
     ) -> None:
         if _TRAINING.locked():
@@ -94,9 +96,8 @@ class Trainer:
                 load_initial_weights(setup.agent, setup.home)
             self._resources = stack.pop_all()
         self.config, self._source, self._resumed = setup.config, source, resumed
-        self._averages, self._guard = Averages(), LossGuard()
-        self._worker_losses = 0
-        self._stops = False  # a callback stops training
+        self._averages, self._guard, self._skip_damaged = Averages(), LossGuard(), skip_damaged
+        self._worker_losses, self._stops = 0, False  # stops: a callback ends the training
 
     def __enter__(self) -> Trainer:
         """Return the trainer."""
@@ -178,7 +179,7 @@ class Trainer:
                 self._callbacks,
             )
             if start is not None:
-                self._saver.restore(start)
+                self._saver.restore(start, skip_damaged=self._skip_damaged)
             if self._resumed is not None:
                 run.record_resumption(start.step if start else 0)
             outcome = None

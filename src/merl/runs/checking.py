@@ -1,0 +1,88 @@
+"""Check a whole run folder for damage, without changing anything."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from merl.core import LOCK_FILE, METRICS_FILE, MerlError, counted
+from merl.core.files import open_file
+from merl.replay import ReplaySpec
+from merl.replay.damage import find_damage
+from merl.runs.checkpoint import Checkpoint, folders, readable
+from merl.runs.metrics import read_rows
+from merl.runs.run import Run
+
+
+class Finding(NamedTuple):
+    """One line of a check."""
+
+    sound: bool
+    text: str
+
+
+def check_run(run: Run) -> Iterator[Finding]:
+    """Yield what is sound and what is damaged in a run whose `config.json` has been read.
+
+    Raises:
+        MerlError: a process trains in the folder, so that its files change.
+    """
+    with _not_in_use(run.path):
+        yield Finding(True, f"{run.path}/config.json is sound")
+        last = None
+        for path in folders(run.checkpoints):
+            try:
+                last = Checkpoint.open(path)
+                yield Finding(True, f"{path} is sound")
+            except MerlError as error:
+                yield Finding(False, str(error))
+        try:
+            rows = counted(len(read_rows(run.path / METRICS_FILE)[1]), "row")
+            yield Finding(True, f"{run.path / METRICS_FILE} can be read: {rows}")
+        except MerlError as error:
+            yield Finding(False, str(error))
+        if last is not None:
+            yield from _check_replay(run, last)
+
+
+def _check_replay(run: Run, start: Checkpoint) -> Iterator[Finding]:
+    """Compare the replay with its checksums in a checkpoint."""
+    if not run.replay.is_dir():
+        yield Finding(False, f"{run.replay} is gone: the run can be evaluated, not resumed")
+        return
+    try:
+        config = run.config
+        spec = ReplaySpec.of(
+            config.replay, *run.spaces(), capacity=config.capacity, rings=config.num_envs
+        )
+        with readable(start):
+            state = start.state()["replay"]
+            damage = find_damage(run.replay, spec, state)
+    except MerlError as error:
+        yield Finding(False, str(error))
+        return
+    yield from (Finding(False, str(each)) for each in damage)
+    if not damage:
+        known = "is sound" if "covered" in state else "can be read; it has no checksums"
+        steps = counted(sum(int(ring["steps"]) for ring in state["rings"]), "step")
+        yield Finding(True, f"{run.replay} {known}: {steps} of checkpoint {start.path.name}")
+
+
+@contextmanager
+def _not_in_use(run: Path) -> Iterator[None]:
+    """Hold the lock of a run, if it has one, without writing into it."""
+    path = run / LOCK_FILE
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(open_file(path))
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            pass
+        except BlockingIOError:
+            raise MerlError(f"a process is training in {run}: stop it first") from None
+        except OSError as error:
+            raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
+        yield

@@ -22,9 +22,10 @@ from merl.replay import ReplayBuffer
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
+from merl.training.actors import Actors
 from merl.training.evaluator import Evaluations
 from merl.training.initial import load_initial_weights
-from merl.training.loop import Collector, Progress, StepResult, train
+from merl.training.loop import Collector, Progress, StepResult, train, train_from
 from merl.training.meters import Averages, Clock, EpisodeWatch
 from merl.training.outcome import Outcome
 from merl.training.saving import Saver
@@ -82,8 +83,14 @@ class Trainer:
         if _TRAINING.locked():
             raise MerlError(_BUSY)
         self._csv = CSV()
-        self._callbacks = CallbackList([self._csv, *make_loggers(config.log), *callbacks])
+        notified = [self._csv, *make_loggers(config.log), *callbacks]
         with ExitStack() as stack:
+            self._actors: Actors | None = None
+            if config.has_actors:
+                self._actors = stack.enter_context(Actors.listening(config))
+                make = make or self._actors.make_env(resumed[0] if resumed else None)
+                notified.append(self._actors)
+            self._callbacks = CallbackList(notified)
             prepared = Setup.prepare(config, new=resumed is None, source=source, make=make)
             self.setup = setup = stack.enter_context(prepared)
             if resumed is not None:
@@ -233,7 +240,8 @@ class Trainer:
         self.clock.mark(progress)
         watch = EpisodeWatch(self.config, progress.step)
         for count, result in enumerate(steps):
-            if count == 0 and not result.lost and not self._saver.resumes_exactly():
+            is_checked = count == 0 and not result.lost and self._actors is None
+            if is_checked and not self._saver.resumes_exactly():
                 self.warn(
                     "a resumed run will have other episodes than an uninterrupted run, unless the "
                     "environment draws its random numbers from Gymnasium's np_random, or from the "
@@ -270,6 +278,9 @@ class Trainer:
             self._callbacks.on_warning,
             setup.progress.updates,
         )
+        is_to_stop = lambda: self._interrupt.number is not None  # noqa: E731
+        if self._actors is not None:
+            return train_from(self._actors, update, setup.progress, self.config, is_to_stop)
         return train(
             Collector(self._environments, self.replay, stacks),
             setup.agent,
@@ -277,7 +288,7 @@ class Trainer:
             setup.progress,
             setup.randomness,
             self.config,
-            lambda: self._interrupt.number is not None,
+            is_to_stop,
         )
 
     def _handle(self, result: StepResult) -> None:

@@ -1,0 +1,10 @@
+"""The command merl learner."""
+
+from __future__ import annotations
+
+from merl.cli.train import train
+
+
+def learner(args: list[str]) -> int:
+    """Train with actors: merl learner TASK [--actors.listen HOST:PORT] [--num-envs N] ..."""
+    return train(args, acts=False)

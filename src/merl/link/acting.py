@@ -176,6 +176,8 @@ class Actor:
         self._limits, self._stop = limits, stop
         self._loaded = False
         self.policy = 0
+        self._stack.reset(spec.space.sample())
+        self._agent.act(self._stack.observation(), explore=True, step=0)  # the first takes longer
 
     def episodes(self) -> Iterator[tuple[Episode, Driven]]:
         """Act; yield after each episode, until the run is done or a stop.

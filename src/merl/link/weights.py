@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from merl.agents import AGENTS
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import user_encoders
 from merl.config import TrainConfig
@@ -19,8 +20,15 @@ def check_can_act(config: TrainConfig) -> None:
     """Check that actors can have the agent of a run: no code of the user's is sent to them.
 
     Raises:
-        MerlError: its agent or one of its encoders is the user's own class.
+        MerlError: its agent or one of its encoders is the user's own class, or the agent only
+            imitates.
     """
+    kind = AGENTS.get(config.agent_name)
+    if kind is not None and kind.imitates:
+        raise MerlError(
+            f"agent {config.agent_name} learns from demonstrations alone, and needs no actor: "
+            "train it with `merl train`"
+        )
     own = [name for name in (config.agent_name, *user_encoders(config.agent)) if ":" in name]
     if own:
         raise MerlError(

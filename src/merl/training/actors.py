@@ -205,7 +205,7 @@ class Actors(Callback):
         self._published = self._trainer.progress.updates
         form, data = weights.pack(self._trainer.setup.agent)
         with self._changed:
-            self._weights = {"weights": form, "time": time.time()}, data
+            self._weights = {"weights": form}, data
             self._tell()
 
     def _tell(self) -> None:

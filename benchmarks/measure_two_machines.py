@@ -88,10 +88,10 @@ class Arrivals(Callback):
         if result.step < self._warm_up:
             return
         self.times.append(now)
-        slots = self._replay.slots
+        slots, joints = self._replay.slots, self._replay.arrays["observation.joints"]
         sent = [
-            float(self._replay.arrays["observation.joints"][i * slots + ring.timesteps - 1, 0])
-            for i, ring in enumerate(self._replay.rings)
+            float(joints[index * slots + (ring.timesteps - 1) % slots, 0])
+            for index, ring in enumerate(self._replay.rings)
         ]
         self.delays.append(min((now - each) % WRAP for each in sent))
 

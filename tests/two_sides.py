@@ -93,7 +93,8 @@ class Sides:
 
     def output(self, name: str) -> str:
         """Return all output of a side so far."""
-        return (self.folder / f"{name}.log").read_text()
+        file = self.folder / f"{name}.log"
+        return file.read_text() if file.exists() else ""
 
     def _start(self, folder: str, log: str, arguments: list[str]) -> BaseProcess:
         (self.folder / folder).mkdir(exist_ok=True)

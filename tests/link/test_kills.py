@@ -15,13 +15,13 @@ import pytest
 
 from helpers import wait_for
 from merl.link.timesteps import Layout
-from merl.replay import ReplayBuffer
+from merl.replay import ReplayBuffer, ReplaySpec
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
 from merl.training.loop import updates_due
 from two_sides import Sides
 
-STEPS = ("--steps", "1000000", "--replay.capacity", "60000")
+STEPS = ("--steps", "1000000", "--replay.capacity", "200000")
 
 
 @pytest.fixture
@@ -47,7 +47,9 @@ def spooled(run: Run, folder: Path) -> dict[int, float]:
 
 def stored(run: Run, rings: int) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, int]]:
     """Return counts and positions of all timesteps of each ring at the last checkpoint."""
-    buffer = ReplayBuffer(replay_spec(run, rings), run.replay)
+    config = run.config
+    spec = ReplaySpec.of(config.replay, *run.spaces(), capacity=config.capacity, rings=rings)
+    buffer = ReplayBuffer(spec, run.replay)
     state = Checkpoint.find(run.checkpoints).state()
     buffer.load_state_dict(state["replay"])
     counts, positions = [], []
@@ -61,13 +63,6 @@ def stored(run: Run, rings: int) -> tuple[list[np.ndarray], list[np.ndarray], di
         assert (buffer.arrays["reward"][slots] == rewards).all()
         assert sum(positions[-1] > 0) == ring.steps
     return counts, positions, state["progress"]
-
-
-def replay_spec(run: Run, rings: int):
-    from merl.replay import ReplaySpec
-
-    config = run.config
-    return ReplaySpec.of(config.replay, *run.spaces(), capacity=config.capacity, rings=rings)
 
 
 def check_sequence(counts: np.ndarray, positions: np.ndarray, log: Path, kills: int) -> None:
@@ -98,7 +93,7 @@ def test_killed_sides_lose_and_repeat_nothing(
         return process
 
     running = {"learner": start("learner")}
-    wait_for(lambda: "waiting" in sides.output("learner") if log(sides).exists() else False)
+    wait_for(lambda: "waiting" in sides.output("learner"))
     running |= {name: start(name) for name in names}
     seen: dict[str, dict[int, float]] = {name: {} for name in names}
     left = dict.fromkeys(("learner", *names), kills)
@@ -116,11 +111,11 @@ def test_killed_sides_lose_and_repeat_nothing(
             running[name].join()
             left[name] -= 1
             if name != "learner":
-                seen[name] |= spooled(run, tmp_path / name / "spool")
-    for name in ("learner", *names):
-        if not running[name].is_alive():
+                for number, count in spooled(run, tmp_path / name / "spool").items():
+                    assert seen[name].setdefault(number, count) == count
+    for name in ("learner", *names):  # an actor ends by itself if the learner is not there yet
+        while time.sleep(2) or not running[name].is_alive():
             running[name] = start(name)
-            time.sleep(2)
     end(sides, running, names)
     run = Run.open(sides.run)
     counts, positions, progress = stored(run, actors)
@@ -129,11 +124,8 @@ def test_killed_sides_lose_and_repeat_nothing(
         names.remove(owner)
         check_sequence(counts[ring], positions[ring], tmp_path / owner / "count", kills)
     assert progress["step"] == sum((p > 0).sum() for p in positions)
-    assert progress["updates"] == updates_due(progress["step"] - run.config.seed_steps, 1.0)
-
-
-def log(sides: Sides) -> Path:
-    return sides.folder / "learner.log"
+    due = updates_due(progress["step"] - run.config.seed_steps, run.config.updates_per_step)
+    assert due - 1 <= progress["updates"] <= due  # the signal may come before the last one
 
 
 def fits(seen: dict[int, float], counts: np.ndarray) -> bool:

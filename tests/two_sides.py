@@ -81,7 +81,7 @@ class Sides:
 
     def learner(self) -> BaseProcess:
         """Start or resume the learner."""
-        return self._start("server", "learner", self._learner)
+        return self.start("server", "learner", self._learner)
 
     def actor(self, name: str = "actor", *options: str) -> BaseProcess:
         """Start an actor with its own folder."""
@@ -89,14 +89,15 @@ class Sides:
         folder.mkdir(exist_ok=True)
         (folder / "counting.py").write_text(COUNTING)
         command = ["actor", "--connect", f"127.0.0.1:{self.port}", "--env", "counting:make"]
-        return self._start(name, name, [*command, *options])
+        return self.start(name, name, [*command, *options])
 
     def output(self, name: str) -> str:
         """Return all output of a side so far."""
         file = self.folder / f"{name}.log"
         return file.read_text() if file.exists() else ""
 
-    def _start(self, folder: str, log: str, arguments: list[str]) -> BaseProcess:
+    def start(self, folder: str, log: str, arguments: list[str]) -> BaseProcess:
+        """Start a command in a folder, with its output in `LOG.log`."""
         (self.folder / folder).mkdir(exist_ok=True)
         process = self._context.Process(
             target=run_merl, args=(self.folder / folder, self.folder / f"{log}.log", arguments)

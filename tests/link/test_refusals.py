@@ -126,10 +126,11 @@ def test_actors_that_do_not_fit_are_refused(
         assert "the actions' bounds was low [-2.0], high [2.0] and is low [-5.0]" in told
         told = refused(*connect, "counting_here:make")
         assert "all places of the run are taken (--num-envs 1)" in told
-        (sides.run / "actors.json").write_text("[null]")
-        assert "observation 'joint' is nan" in refused(*connect, "others:nan", code=3)
         os.kill(actor.pid or 0, signal.SIGTERM)
         actor.join(60)
+        assert actor.exitcode == 128 + signal.SIGTERM, sides.output("actor")
+        (sides.run / "actors.json").write_text("[null]")  # its spool is lost
+        assert "observation 'joint' is nan" in refused(*connect, "others:nan", code=3)
     finally:
         os.kill(learner.pid or 0, signal.SIGTERM)
         learner.join(60)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from merl.cli.train import train
+from merl.cli.train import TrainOptions, train
+
+LearnerOptions = TrainOptions
+"""The options are those of `merl train`; only some defaults differ."""
 
 
 def learner(args: list[str]) -> int:

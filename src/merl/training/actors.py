@@ -6,15 +6,12 @@ agent nor the replay: the loop stores what they received.
 
 from __future__ import annotations
 
-import json
 import logging
 import socket
 import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
@@ -29,12 +26,12 @@ from merl.core import MerlError
 from merl.core.guards import check_finite
 from merl.envs.user_env import MakeEnv
 from merl.link import weights
+from merl.link.places import Place, place_of
 from merl.link.protocol import TOKEN, Address, Channel, greet_actor, listen, read_token
 from merl.link.timesteps import Layout, Timestep
 from merl.runs import record
 from merl.runs.plain import to_plain
 from merl.runs.run import Run
-from merl.runs.run_folder import ACTORS_FILE
 from merl.training.loop import Progress
 from merl.training.outcome import Outcome
 
@@ -48,23 +45,6 @@ PAUSE = 0.005
 END = 10.0
 """Seconds within which the actors must have heard that the run is done."""
 _LOG = logging.getLogger(__name__)
-
-
-@dataclass
-class _Place:
-    """One actor's ring of the replay.
-
-    Attributes:
-        received: number of the newest timestep that arrived.
-        saved: number of the newest timestep in a checkpoint.
-        channel: the actor's newest connection.
-        session: held by the thread that serves it.
-    """
-
-    received: int = 0
-    saved: int = 0
-    channel: Channel | None = None
-    session: threading.Lock = field(default_factory=threading.Lock)
 
 
 class Actors(Callback):
@@ -85,17 +65,20 @@ class Actors(Callback):
         self._weights: tuple[dict[str, Any], bytes] | None = None
         self._is_closed = self._is_done = False
         self._queue: SimpleQueue[tuple[int, Timestep]] = SimpleQueue()
-        self._places = [_Place() for _ in range(config.num_envs)]
+        self._places = [Place() for _ in range(config.num_envs)]
         self._published = 0  # updates of the newest weights
 
     @classmethod
     @contextmanager
-    def listening(cls, config: TrainConfig) -> Iterator[Actors]:
-        """Listen at the address of the config.
+    def listening(cls, config: TrainConfig) -> Iterator[Actors | None]:
+        """Listen at the address of the config; yield None if it has none.
 
         Raises:
             MerlError: the address or the token cannot be used, or actors cannot have the agent.
         """
+        if not config.has_actors:
+            yield None
+            return
         weights.check_can_act(config)
         address = Address.parse(str(config.actors.listen), "--actors.listen")
         token = read_token(config.actors.token)
@@ -270,7 +253,7 @@ class Actors(Callback):
         channel.send({"run": self._trainer.run.public_id})
         message, _ = channel.receive(4096)
         with self._changed:
-            return _place_of(str(message["actor"]), self._trainer.run.path, len(self._places))
+            return place_of(str(message["actor"]), self._trainer.run.path, len(self._places))
 
     def _exchange(self, index: int, channel: Channel) -> None:
         """Receive timesteps, and send news in a second thread, until the connection ends."""
@@ -345,28 +328,3 @@ class Actors(Callback):
                 if is_done:
                     return
                 time.sleep(PAUSE)
-
-
-def _place_of(actor: str, run: Path, count: int) -> int:
-    """Return the place of an actor; a new one takes a free place.
-
-    Raises:
-        MerlError: all places are taken by others.
-    """
-    file = run / ACTORS_FILE
-    names: list[Any] = json.loads(file.read_text()) if file.exists() else []
-    if actor in names:
-        return names.index(actor)
-    if None not in names:
-        if len(names) >= count:
-            raise MerlError(
-                f"all places of the run are taken (--num-envs {count}): start the actor with the "
-                f"--spool that it had; if that is lost, write null for it in {file}"
-            )
-        names.append(None)
-    place = names.index(None)
-    names[place] = actor
-    part = file.with_name(f".{file.name}.part")
-    part.write_text(json.dumps(names))
-    part.replace(file)
-    return place

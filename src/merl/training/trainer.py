@@ -85,9 +85,8 @@ class Trainer:
         self._csv = CSV()
         notified = [self._csv, *make_loggers(config.log), *callbacks]
         with ExitStack() as stack:
-            self._actors: Actors | None = None
-            if config.has_actors:
-                self._actors = stack.enter_context(Actors.listening(config))
+            self._actors = stack.enter_context(Actors.listening(config))
+            if self._actors is not None:
                 make = make or self._actors.make_env(resumed[0] if resumed else None)
                 notified.append(self._actors)
             self._callbacks = CallbackList(notified)
@@ -171,16 +170,8 @@ class Trainer:
                 self._environments = setup.make_environments()
             stack.callback(self._environments.close)
             self.evaluations = Evaluations(setup, run, self.clock, self._callbacks, self._interrupt)
-            self._saver = Saver(
-                setup,
-                run,
-                self.replay,
-                self._environments,
-                self.evaluations,
-                self.clock,
-                self._guard,
-                self._callbacks,
-            )
+            watched = self.evaluations, self.clock, self._guard, self._callbacks
+            self._saver = Saver(setup, run, self.replay, self._environments, *watched)
             if start is not None:
                 self._saver.restore(start)
             if self._resumed is not None:
@@ -240,8 +231,7 @@ class Trainer:
         self.clock.mark(progress)
         watch = EpisodeWatch(self.config, progress.step)
         for count, result in enumerate(steps):
-            is_checked = count == 0 and not result.lost and self._actors is None
-            if is_checked and not self._saver.resumes_exactly():
+            if count == 0 and not result.lost and not self._saver.resumes_exactly():
                 self.warn(
                     "a resumed run will have other episodes than an uninterrupted run, unless the "
                     "environment draws its random numbers from Gymnasium's np_random, or from the "

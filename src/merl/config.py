@@ -72,6 +72,23 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True)
+class ActorsConfig:
+    """Settings of a run whose environments are on other machines (`merl actor`)."""
+
+    listen: str | None = None
+    """HOST:PORT at which the run waits for its --num-envs actors, which act in its place. Another
+    host than 127.0.0.1 needs a token."""
+    token: Path | None = None
+    """File with a secret that the actors know too; if not set, the environment variable
+    MERL_TOKEN."""
+    weights_every: Steps = 50
+    """Updates after which the actors get the newest policy."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "actors.")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Train an agent on a task.
 
@@ -142,6 +159,7 @@ class TrainConfig:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     agent: ObservationConfig = field(default_factory=lambda: AGENTS["merl"].config)
     eval: EvaluationConfig = field(default_factory=EvaluationConfig)
+    actors: ActorsConfig = field(default_factory=ActorsConfig)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -153,6 +171,11 @@ class TrainConfig:
             raise MerlError(
                 f"agent {self.agent_name!r} needs a config of type {kind.__name__}, not "
                 f"{type(self.agent).__name__}"
+            )
+        if self.has_actors and self.random_steps:
+            raise MerlError(
+                f"random-steps is {self.random_steps}, but the actors act: set it to 0, and give "
+                "--random-steps to `merl actor`"
             )
         if self.eval.start is not None and self.has_user_env:
             raise MerlError(
@@ -183,7 +206,17 @@ class TrainConfig:
     @property
     def has_workers(self) -> bool:
         """Return whether the environments run in worker processes."""
-        return self.num_envs > 1 or not self.synchronous
+        return (self.num_envs > 1 or not self.synchronous) and not self.has_actors
+
+    @property
+    def has_actors(self) -> bool:
+        """Return whether the environments are those of actors, on other machines."""
+        return self.actors.listen is not None
+
+    @property
+    def lacks_env(self) -> bool:
+        """Return whether only the actors can make the environment, since it is never evaluated."""
+        return self.has_actors and self.has_user_env and not self.eval.every
 
     @property
     def eval_steps(self) -> int:

@@ -1,10 +1,11 @@
-"""Environments in which nothing moves, for an agent that learns from demonstrations alone."""
+"""Environments in which nothing moves: an agent only imitates, or acts on another machine."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -57,3 +58,22 @@ class StillEnvs:
 
     def close(self) -> None:
         """Do nothing."""
+
+
+class StillEnv(gymnasium.Env[Any, Any]):
+    """An environment that only has spaces, those of an environment on another machine.
+
+    Args:
+        space: the observation space, in the form that agents use.
+        action_space: the action space, in [-1, 1].
+        bounds: see `merl.acting.run_env.own_bounds`.
+    """
+
+    def __init__(
+        self,
+        space: spaces.Dict,
+        action_space: spaces.Box,
+        bounds: tuple[list[float], list[float]] | None,
+    ) -> None:
+        self.observation_space, self.action_space = space, action_space
+        self.own_bounds = bounds

@@ -26,6 +26,8 @@ from merl.core.python_path import working_folder_hidden
 COMMANDS = {
     "train": "train an agent on a task",
     "resume": "continue a run that was stopped",
+    "learner": "train with actors on other machines, e.g. a robot's computer",
+    "actor": "act for a learner, in an environment of this machine",
     "evaluate": "run a trained policy, record a video",
     "run": "run a trained policy in real time, e.g. on a robot",
     "export": "write a trained policy to an ONNX or torch file",
@@ -50,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     nonzero exit code.
     """
     args = list(sys.argv[1:] if arguments is None else arguments)
-    only_prints = args[:1] not in (["train"], ["resume"])
+    only_prints = args[:1] not in (["train"], ["resume"], ["learner"], ["actor"])
     try:
         with tolerant_output() as (out, _), working_folder_hidden(), _warnings_on_stderr():
             code = _run(args)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,14 +13,21 @@ from merl.agents import AGENTS
 from merl.agents.config import ObservationConfig
 from merl.cli.parsing import parse
 from merl.cli.running import Damaged, begin, go_on
-from merl.config import Setting, Source, TrainConfig, flat
+from merl.config import ActorsConfig, Setting, Source, TrainConfig, flat
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.cloning import starts_cloned
 from merl.experiments.presets import PRESETS, compose, default_preset
+from merl.link.protocol import PORT
 from merl.runs.resume import decided, left_open
 from merl.runs.run import Run
 
 PROG = "merl train"
+LEARNER: dict[str, Any] = {
+    "actors": ActorsConfig(listen=f"127.0.0.1:{PORT}"),
+    "random_steps": 0,
+    "num_envs": 1,
+}
+"""Defaults of `merl learner` that differ from those of `merl train`."""
 
 
 @dataclass(frozen=True)
@@ -61,19 +67,28 @@ class _First(Choice):
     help: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(aliases=["-h"])] = False
 
 
-def train(args: list[str]) -> int:
-    """Train an agent: merl train TASK [--preset paper|laptop|demos|state|smoke] [--steps N] ..."""
+def train(args: list[str], *, acts: bool = True) -> int:
+    """Train an agent: merl train TASK [--preset paper|laptop|demos|state|smoke] [--steps N] ...
+
+    Args:
+        args: the arguments after the command's name.
+        acts: whether the run acts itself; False: it is `merl learner`, with other defaults.
+    """
     rest: list[str] = []
-    first = parse(_First, PROG, args, rest=rest)
+    prog = PROG if acts else "merl learner"
+    first = parse(_First, prog, args, rest=rest)
     preset = default_preset() if first.preset is None else first.preset
     source = Source(preset, first.setting)
-    composed = partial(compose, preset, agent=first.agent, setting=first.setting)
+
+    def composed(task: str) -> TrainConfig:
+        config = compose(preset, task, first.agent, first.setting)
+        return config if acts else dataclasses.replace(config, **LEARNER)
 
     def options(default: TrainConfig) -> TrainOptions:
         choice = Choice(preset, default.agent_name, first.setting)
         agent = dataclasses.replace(default.agent, **_by_key(rest, default.agent))
         without_task = dataclasses.replace(default, task=tyro.MISSING, agent=agent)
-        return parse(TrainOptions, PROG, args, default=TrainOptions(choice, without_task))
+        return parse(TrainOptions, prog, args, default=TrainOptions(choice, without_task))
 
     default, given_open = composed("reach_duplo"), set[str]()
     if not first.help:  # the help shows the defaults of a task of merl's own

@@ -56,6 +56,9 @@ HARMLESS = (
     "eval.video",
     "eval.references",
     "demos",
+    "actors.listen",
+    "actors.token",
+    "actors.weights_every",
     "agent.precision",
     "agent.torch_compile",
 )

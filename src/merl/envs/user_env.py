@@ -60,6 +60,8 @@ def make_user_env(
     if render_mode is not None and not _renders(env):
         env.close()
         env = _make(task, None, make)
+    if env.has_wrapper_attr("own_bounds"):
+        return env  # it has that form already
     try:
         return adapt(env, config)
     except BaseException:

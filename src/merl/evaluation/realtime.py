@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast
+from typing import Any, Literal, Protocol, cast
 
 import gymnasium
 import numpy as np
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError, Observation
 from merl.core.guards import check_finite
-from merl.demos.episode import EpisodeRecording
 from merl.evaluation.evaluation import Act
 
 End = Literal["terminated", "truncated", "stopped", "time", "late"]
@@ -77,11 +76,30 @@ class Driven:
     end: End
 
 
+class Recording(Protocol):
+    """Recording of an episode's steps, such as `merl.demos.episode.EpisodeRecording`."""
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        ...
+
+    def add(
+        self,
+        action: NDArray[np.float32],
+        intended: NDArray[np.float32],
+        observation: Observation,
+        reward: float,
+        info: Mapping[str, Any],
+    ) -> None:
+        """Add a step."""
+        ...
+
+
 def drive(
     act: Act,
     env: gymnasium.Env[Any, Any],
     observation: Observation,
-    recording: EpisodeRecording,
+    recording: Recording,
     rate: float,
     limits: Limits,
     stop: Callable[[], bool],

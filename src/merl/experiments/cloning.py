@@ -14,7 +14,7 @@ from merl.agents import AGENTS
 from merl.agents.bc import BCConfig
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
-from merl.config import Source, TrainConfig, override
+from merl.config import ActorsConfig, Source, TrainConfig, override
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import IMITATING
 from merl.runs.run import Run
@@ -90,4 +90,4 @@ def _cloning(config: TrainConfig, folder: Path) -> TrainConfig:
     bc = BCConfig(**{name: getattr(agent, name) for name in names})
     every = min(config.eval.every, -(-config.demos_pretrain // 3))
     values = IMITATING | {"steps": config.demos_pretrain, "run_dir": folder, "eval.every": every}
-    return override(replace(config, agent_name="bc", agent=bc), values)
+    return override(replace(config, agent_name="bc", agent=bc, actors=ActorsConfig()), values)

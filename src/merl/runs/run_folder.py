@@ -21,7 +21,9 @@ PRETRAINED = Path(__file__).parent.parent / "pretrained"
 """Folder of the trained policies that come with merl: run folders without a replay."""
 PART = f".{CONFIG_FILE}.part"
 """Temporary name of `config.json` while it is written."""
-_FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, PART, LOCK_FILE)
+ACTORS_FILE = "actors.json"
+"""File in a run folder that names the actor of each ring of the replay."""
+_FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, PART, LOCK_FILE, ACTORS_FILE)
 _FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 
 

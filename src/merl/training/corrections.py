@@ -67,6 +67,8 @@ class Corrections:
         if not correct.corrects():
             yield None
             return
+        if setup.config.has_actors:
+            raise MerlError("a callback corrects actions, but this run's actors act elsewhere")
         if setup.demos is None:
             raise MerlError(
                 "a callback corrects actions, which become demonstrations, but the run has none to "

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -167,6 +167,45 @@ def train(
             continue
         if config.synchronous or progress.step >= config.steps:
             learning = learn(step) or learning
+        progress.episodes += len(ended)
+        yield StepResult(progress.step, progress.updates, learning, ended)
+
+
+class Receiver(Protocol):
+    """Receiver of transitions that others collect."""
+
+    def store(self, progress: Progress, repeat: int) -> tuple[Episode, ...]:
+        """Wait a moment for a transition and store it in the replay.
+
+        Args:
+            progress: counts of the run; `step` is increased by `repeat` for a transition.
+            repeat: environment steps of each transition.
+
+        Returns:
+            The episode that has ended, if one has.
+        """
+        ...
+
+
+def train_from(
+    receiver: Receiver,
+    update: Update,
+    progress: Progress,
+    config: TrainConfig,
+    is_to_stop: Callable[[], bool] = lambda: False,
+) -> Iterator[StepResult]:
+    """Learn from received transitions; yield after each of them, or after a moment without.
+
+    Arguments as of `train`.
+    """
+    learn = partial(_learn, update, progress, config, is_to_stop)
+    remaining = learn(max(0, progress.step - config.action_repeat))
+    if remaining or is_to_stop():
+        yield StepResult(progress.step, progress.updates, remaining)
+    while progress.step < config.steps:
+        step = progress.step
+        ended = receiver.store(progress, config.action_repeat)
+        learning = learn(step)
         progress.episodes += len(ended)
         yield StepResult(progress.step, progress.updates, learning, ended)
 

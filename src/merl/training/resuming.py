@@ -73,7 +73,7 @@ def resumption(
         config = reopened(config, run.left_open)
     check_links(run.path)
     with run.lock():
-        if imports:
+        if imports and not config.lacks_env:
             run.load_module(trusted=trusted, named_in=named_in)
         run.load_encoders(trusted=trusted, named_in=named_in)
         if run.begin_again():

@@ -139,7 +139,12 @@ class Saver:
             ) from None
 
     def resumes_exactly(self) -> bool:
-        """Return whether the environments' random generators are part of the checkpoint."""
+        """Return whether the environments' random generators are part of the checkpoint.
+
+        Actors keep their own, and their runs need not resume exactly.
+        """
+        if self._setup.config.has_actors:
+            return True
         return all(state and "bit_generator" in state for state in self._environment_states())
 
     def _environment_states(self) -> Sequence[Mapping[str, Any] | None]:

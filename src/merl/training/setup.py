@@ -111,9 +111,9 @@ class Setup:
     def make_environments(self) -> Environments:
         """Return the environments that the run trains in: `env`, or worker processes.
 
-        An agent that imitates moves nothing while it trains.
+        An agent that imitates moves nothing while it trains, and actors act elsewhere.
         """
-        if self.imitates:
+        if self.imitates or self.config.has_actors:
             return StillEnvs(self.space, self.action_space, self.config.num_envs)
         if self.config.has_workers:
             return WorkerEnvs(self.config, self.env, self.make)

@@ -22,10 +22,11 @@ from merl.replay import ReplayBuffer
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
 from merl.runs.run_folder import resume_line
+from merl.training.actors import Actors
 from merl.training.corrections import Corrections
 from merl.training.evaluator import Evaluations
 from merl.training.initial import load_initial_weights
-from merl.training.loop import Collector, Progress, StepResult, train
+from merl.training.loop import Collector, Progress, StepResult, train, train_from
 from merl.training.meters import Averages, Clock, EpisodeWatch
 from merl.training.outcome import Outcome
 from merl.training.saving import Saver
@@ -85,8 +86,13 @@ class Trainer:
         if _TRAINING.locked():
             raise MerlError(_BUSY)
         self._csv = CSV()
-        self._callbacks = CallbackList([self._csv, *make_loggers(config.log), *callbacks])
+        notified = [self._csv, *make_loggers(config.log), *callbacks]
         with ExitStack() as stack:
+            self._actors = stack.enter_context(Actors.listening(config))
+            if self._actors is not None:
+                make = make or self._actors.make_env(resumed[0] if resumed else None)
+                notified.append(self._actors)
+            self._callbacks = CallbackList(notified)
             prepared = Setup.prepare(config, new=resumed is None, source=source, make=make)
             self.setup = setup = stack.enter_context(prepared)
             if resumed is not None:
@@ -165,19 +171,10 @@ class Trainer:
             with self._interrupt.raising():
                 self._environments = setup.make_environments()
             stack.callback(self._environments.close)
-            corrections = Corrections.of(self._callbacks, setup, run)
-            self._corrections = stack.enter_context(corrections)
+            self._corrections = stack.enter_context(Corrections.of(self._callbacks, setup, run))
             self.evaluations = Evaluations(setup, run, self.clock, self._callbacks, self._interrupt)
-            self._saver = Saver(
-                setup,
-                run,
-                self.replay,
-                self._environments,
-                self.evaluations,
-                self.clock,
-                self._guard,
-                self._callbacks,
-            )
+            watched = self.evaluations, self.clock, self._guard, self._callbacks
+            self._saver = Saver(setup, run, self.replay, self._environments, *watched)
             if start is not None:
                 self._saver.restore(start, skip_damaged=self._skip_damaged)
             if self._resumed is not None:
@@ -274,6 +271,9 @@ class Trainer:
             self._callbacks.on_warning,
             setup.progress.updates,
         )
+        is_to_stop = lambda: self._interrupt.number is not None  # noqa: E731
+        if self._actors is not None:
+            return train_from(self._actors, update, setup.progress, self.config, is_to_stop)
         return train(
             Collector(self._environments, self.replay, stacks, self._corrections),
             setup.agent,
@@ -281,7 +281,7 @@ class Trainer:
             setup.progress,
             setup.randomness,
             self.config,
-            lambda: self._interrupt.number is not None,
+            is_to_stop,
         )
 
     def _handle(self, result: StepResult) -> None:

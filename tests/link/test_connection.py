@@ -6,11 +6,12 @@ import socket
 import threading
 from pathlib import Path
 
+from test_spool import LAYOUT, fill
+
 from helpers import wait_for
 from merl.link.connection import Connection
 from merl.link.protocol import Address, Channel
 from merl.link.spool import Spool
-from test_spool import LAYOUT, fill
 
 
 def test_timesteps_stay_until_a_checkpoint_holds_them(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ COMMANDS = {
     "export": "write a trained policy to an ONNX or torch file",
     "robustness": "evaluate a policy while its senses are disturbed",
     "demos": "record demonstrations, from which a run can learn",
+    "classifier": "train a classifier of success from demonstrations",
     "sweep": "run the experiments of the paper, or your own",
     "report": "draw and compare learning curves",
     "check": "find damaged files in a run",

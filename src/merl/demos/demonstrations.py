@@ -126,13 +126,15 @@ class Demonstrations:
                 found = {name: arrays[name] for name in arrays.files}
             observations = {key: found[KEY + key] for key in self.observation_space}
             actions, intended, rewards = found["action"], found["intended"], found["reward"]
-            terminated = bool(found["terminated"])
+            terminated, successes = bool(found["terminated"]), found.get("success")
         except (
             *(OSError, ValueError, KeyError, EOFError, TypeError, AttributeError),
             *(zipfile.BadZipFile, zlib.error),
         ) as error:
             raise MerlError(f"{file} cannot be read: {error}: record it again") from None
-        episode = Episode(observations, actions, intended, rewards, terminated, line.success)
+        episode = Episode(
+            observations, actions, intended, rewards, terminated, line.success, successes
+        )
         if len(episode) != line.steps:
             raise MerlError(f"{file} has {len(episode)} steps, and {INDEX} says {line.steps}")
         check_episode(str(file), episode, self.observation_space, self.action_space)

@@ -24,6 +24,7 @@ class Episode:
         rewards: (T,), float32.
         terminated: whether it ended by termination, not by a time limit.
         success: whether it was solved at its last step; None if the environment does not say.
+        successes: whether it was solved after each step, (T,); None if that is unknown.
     """
 
     observations: Mapping[str, NDArray[Any]]
@@ -32,6 +33,7 @@ class Episode:
     rewards: NDArray[np.float32]
     terminated: bool
     success: bool | None
+    successes: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -65,6 +67,9 @@ def check_episode(
             f"{where}: rewards are {episode.rewards.dtype} {episode.rewards.shape}, not one number "
             f"for each of {steps} steps"
         )
+    solved = episode.successes
+    if solved is not None and (solved.shape != (steps,) or solved.dtype != np.bool_):
+        raise MerlError(f"{where}: success is {solved.dtype} {solved.shape}, not bool {(steps,)}")
     for each in (episode.actions, episode.intended):
         if each.shape != (steps, *action_space.shape) or each.dtype.kind != "f":
             raise MerlError(
@@ -90,7 +95,7 @@ class EpisodeRecording:
         self._actions: list[NDArray[np.float32]] = []
         self._intended: list[NDArray[np.float32]] = []
         self._rewards: list[float] = []
-        self._success: bool | None = None
+        self._successes: list[bool] = []
 
     def __len__(self) -> int:
         """Return the number of steps so far."""
@@ -118,7 +123,7 @@ class EpisodeRecording:
         self._intended.append(intended)
         self._rewards.append(reward)
         if "success" in info:
-            self._success = bool(info["success"])
+            self._successes.append(bool(info["success"]))
 
     def finish(self, *, terminated: bool) -> Episode:
         """Return the episode, which has at least one step."""
@@ -129,7 +134,8 @@ class EpisodeRecording:
             np.stack(self._intended),
             np.array(self._rewards, np.float32),
             terminated,
-            self._success,
+            self._successes[-1] if self._successes else None,
+            np.array(self._successes) if len(self._successes) == len(self) else None,
         )
 
 

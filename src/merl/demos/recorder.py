@@ -69,6 +69,8 @@ class Recorder:
         }
         arrays |= {"action": episode.actions, "intended": episode.intended}
         arrays |= {"reward": episode.rewards, "terminated": np.array(episode.terminated)}
+        if episode.successes is not None:
+            arrays["success"] = episode.successes
         part = demos.path / f".{INDEX}.part"
         try:
             demos.path.mkdir(parents=True, exist_ok=True)

@@ -347,10 +347,7 @@ def test_resume_and_evaluate_refuse_an_environment_with_other_spaces(
         (["Kitchen-v7"], "is unknown: choose from reach_duplo, move_box, lift_box, or name a"),
         (["FetchReach-v4"], "package gymnasium-robotics: pip install 'gymnasium-robotics', then"),
         (["FetchReach-v4"], "use the task gymnasium_robotics:FetchReach-v4"),
-        (
-            ["gymnasium_robotics:FetchReach-v4"],
-            "it comes with the package gymnasium-robotics: pip install",
-        ),
+        (["panda_gym:PandaReach-v3"], "it comes with the package panda-gym: pip install"),
         (["AdroitHandDoor-v1"], "package gymnasium-robotics"),
         (["AntMaze_UMaze-v4"], "package gymnasium-robotics"),
         (["PandaReach-v3"], "use the task panda_gym:PandaReach-v3"),

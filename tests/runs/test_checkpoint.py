@@ -15,7 +15,7 @@ from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SACConfig
 from merl.core import Batch, MerlError
-from merl.runs.checkpoint import Checkpoint, _fingerprint, load_agent, save
+from merl.runs.checkpoint import Checkpoint, _fingerprint, discard_later, load_agent, save
 from toy import DotEnv
 
 CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")
@@ -124,6 +124,16 @@ def test_resuming_before_a_damaged_checkpoint_keeps_the_good_ones(tmp_path: Path
     save(tmp_path, 200, agent(), {}, score=None, keep=1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00000100", "00000200"]
     assert Checkpoint.find(tmp_path).step == 200
+
+
+def test_a_skipped_checkpoint_does_not_count_among_those_that_are_kept(tmp_path: Path) -> None:
+    """The run resumes before it, and its next checkpoint is after it."""
+    for step in (100, 200):
+        save(tmp_path, step, agent(), {}, score=None, keep=2)
+    (tmp_path / "00000200" / "learner.pt").write_bytes(b"")
+    discard_later(tmp_path, Checkpoint.find(tmp_path).step)
+    save(tmp_path, 300, agent(), {}, score=None, keep=2)
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["00000100", "00000300"]
 
 
 def test_a_checkpoint_of_another_device_loads(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from safetensors.torch import load_file
 from test_recovery import EPISODE, assert_same, line, saved, started, wait_until_saved
 
 from merl.cli import main
+from merl.runs.checkpoint import Checkpoint
 
 CAPACITY = 200
 FURTHER = 60
@@ -175,6 +176,7 @@ def test_a_damaged_last_checkpoint_costs_nothing_but_its_steps(
     assert "overwritten" not in err
     assert f"resumes at step {last - EPISODE}" in out
     assert_same(whole, parts)
+    assert all(Checkpoint.open(path) for path in (parts / "checkpoints").iterdir())
 
 
 def fifo(path: Path) -> None:

@@ -306,23 +306,32 @@ def _is_number(name: str) -> bool:
 
 
 def _prune(root: Path, step: int, keep: int) -> None:
-    """Delete all checkpoints except the last `keep` and the best.
-
-    Checkpoints of later steps than `step` are deleted, too: they were skipped as damaged when the
-    run resumed from an earlier one.
-    """
+    """Delete all checkpoints except the last `keep` and the best, and those after `step`."""
+    discard_later(root, step)
     every = folders(root)
-    past = [path for path in every if int(path.name) <= step]
-    scores = {path: score for path, score in _scores(past) if score is not None}
+    scores = {path: score for path, score in _scores(every) if score is not None}
     best = max(scores, key=lambda path: scores[path]) if scores else None
     stale = [path for path in root.glob(".part-*") if path.is_dir()]
-    for path in [*stale, *(path for path in every if path not in past), *past[:-keep]]:
-        if path == best:
-            continue
-        if path not in stale:  # a process that dies here leaves no half of a checkpoint
-            with suppress(OSError):
-                path = path.rename(root / f".part-{path.name}-pruned")
-        shutil.rmtree(path, ignore_errors=True)
+    for path in [*stale, *(path for path in every[:-keep] if path != best)]:
+        _discard(path)
+
+
+def discard_later(root: Path, step: int) -> None:
+    """Delete the checkpoints of later steps than `step`, from which the run was not resumed.
+
+    They were skipped as damaged, and must not count among those that are kept.
+    """
+    for path in folders(root):
+        if int(path.name) > step:
+            _discard(path)
+
+
+def _discard(path: Path) -> None:
+    """Delete a checkpoint; a process that dies here leaves no half of one."""
+    if not path.name.startswith(".part-"):
+        with suppress(OSError):
+            path = path.rename(path.with_name(f".part-{path.name}-pruned"))
+    shutil.rmtree(path, ignore_errors=True)
 
 
 def _scores(paths: list[Path]) -> Iterator[tuple[Path, float | None]]:

@@ -133,6 +133,7 @@ class Saver:
                 self._states = states if isinstance(states, list) else [states]
                 self._environments.restore(self._states)
                 self._clock.restore(float(state["seconds"]), float(state["cpu_seconds"]))
+            checkpoint.discard_later(self._run.checkpoints, start.step)
         except WorkerDied as died:
             raise EnvironmentsLost(
                 f"an environment's process {died} right after its start: see its output above"

@@ -241,11 +241,10 @@ def test_gl_after_raster_in_one_process(opengl, raster_env):
 
 
 def test_slow_compiling_prints_a_notice(capsys):
-    notice, printed = "merl: compiling the renderer (only once, 5 to 20 s)\n", ""
-    with warp_runtime.compiling(0.1):
-        while not printed:  # like compiling, this loop takes processor time
-            printed = capsys.readouterr().err
-    assert printed == notice
+    with warp_runtime.compiling(0.1) as watching:
+        while watching.is_alive():  # like compiling, this loop takes processor time
+            pass
+    assert capsys.readouterr().err == "merl: compiling the renderer (only once, 5 to 20 s)\n"
 
 
 def test_waiting_for_a_busy_processor_prints_no_notice(capsys):

@@ -103,3 +103,12 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
     content = {name: value for name, value in record.items() if name != _SEAL}
     text = json.dumps(content, sort_keys=True)
     return {**content, _SEAL: f"{zlib.crc32(text.encode()):08x}"}
+
+
+def sync(path: Path) -> None:
+    """Flush a file, or the directory entries of a folder, to disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -17,6 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from merl.core import MerlError, counted
+from merl.core.files import sync
 
 _ABOUT, _LOCK, _SUFFIX = "spool.json", "lock", ".steps"
 
@@ -193,7 +194,7 @@ class Spool:
         self._begin = self.last + 1
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
         self._file = os.open(self._path(self._begin), flags, 0o644)
-        _sync_folder(self.folder)
+        sync(self.folder)
 
     def _path(self, begin: int) -> Path:
         return self.folder / f"{begin:016d}{_SUFFIX}"
@@ -208,7 +209,7 @@ class Spool:
             file.flush()
             os.fsync(file.fileno())
         part.replace(self.folder / _ABOUT)
-        _sync_folder(self.folder)
+        sync(self.folder)
 
 
 def _cut(file: Path, size: int, number: Callable[[bytes], int | None]) -> None:
@@ -221,11 +222,3 @@ def _cut(file: Path, size: int, number: Callable[[bytes], int | None]) -> None:
                 break
             count -= 1
         data.truncate(count * size)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

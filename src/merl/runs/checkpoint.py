@@ -12,7 +12,6 @@ import hashlib
 import io
 import json
 import logging
-import os
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
@@ -27,7 +26,7 @@ from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
 
 from merl.core import Agent, MerlError
-from merl.core.files import open_file, read_json, sealed
+from merl.core.files import open_file, read_json, sealed, sync
 from merl.core.guards import check_weights
 from merl.networks.settings import torch_settings
 
@@ -176,7 +175,7 @@ def save(
         }
         (part / _MANIFEST).write_text(json.dumps(sealed(manifest), indent=1))
         for path in (*part.iterdir(), part):
-            _sync(path)
+            sync(path)
         final = root / f"{step:08d}"
         former = root / f".part-{step:08d}-former"
         if final.exists():  # keep the old one until the new one replaces it
@@ -187,7 +186,7 @@ def save(
             if former.exists():
                 former.rename(final)
             raise
-        _sync(root)
+        sync(root)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
@@ -347,12 +346,3 @@ def _fingerprint(path: Path, most: int | None = None) -> dict[str, Any]:
     with open_file(path, most=most) as file:
         digest = hashlib.file_digest(cast(io.BufferedReader, file), "sha256").hexdigest()
     return {"bytes": path.stat().st_size, "sha256": digest}
-
-
-def _sync(path: Path) -> None:
-    """Flush a file, or the directory entries of a folder, to disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -149,7 +149,9 @@ def _config(plain: dict[str, Any], env: str | None) -> TrainConfig:
     try:
         config = record.config_of({"config": plain})
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise MerlError(f"the learner's config cannot be read ({error}): is it a merl?") from None
+        raise MerlError(
+            f"the learner's config cannot be read ({error}): is it a learner of merl?"
+        ) from None
     check_can_act(config)
     if env is None and imports_code(config.task):
         raise MerlError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -117,14 +117,7 @@ class _Count:
     def __len__(self) -> int:
         return self._steps
 
-    def add(
-        self,
-        action: NDArray[np.float32],
-        intended: NDArray[np.float32],
-        observation: Observation,
-        reward: float,
-        info: Mapping[str, Any],
-    ) -> None:
+    def add(self, *step: Any) -> None:
         self._steps += 1
 
 

@@ -186,7 +186,7 @@ def greet_actor(channel: Channel, token: bytes) -> None:
     """Introduce the learner to an actor; both prove that they know the token.
 
     Raises:
-        MerlError: the actor's token is another one; the actor is told so.
+        MerlError: the actor has another token; this also sends it the reason.
         OSError: the connection is lost.
     """
     channel.limit(GREET_SECONDS)

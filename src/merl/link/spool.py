@@ -124,7 +124,7 @@ class Spool:
             raise MerlError(
                 f"the learner resumed from an older checkpoint, and timesteps {received + 1:,} to "
                 f"{self.first - 1:,} are no longer in {self.folder}: name another folder with "
-                f"--spool to go on without them and the {counted(len(self), 'timestep')} in it"
+                f"--spool; those and the {counted(len(self), 'timestep')} in it are then not used"
             )
         self._new_file()
 

@@ -18,7 +18,7 @@ GRIP = 1.5
 
 
 class HandControl(Controller):
-    """Controller that moves the hand as it is told; see `Controller`.
+    """Controller that moves the hand by a person's commands; see `Controller`.
 
     Attributes:
         command: (5,), in [-1, 1], in the order of `AXES`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -244,3 +245,23 @@ def test_a_soak_for_three_minutes(tmp_path: Path) -> None:
     assert len(values) >= 2
     assert values[-1, 1] > values[0, 1] > 0
     assert (values[:, 2] <= EPISODE).all()
+
+
+def campaign(*options: str) -> str:
+    """Run `benchmarks/campaign.py`, which takes an hour by default; return its last line."""
+    script = Path(__file__).parents[2] / "benchmarks" / "campaign.py"
+    command = [sys.executable, str(script), *options, "--output", "None"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=3000)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout.splitlines()[-1]
+
+
+def test_a_short_campaign_of_kills_finds_no_difference() -> None:
+    last = campaign("--variants", "compressed", "--kills", "9", "--each")
+    assert re.fullmatch(r"\d+ kills, 0 differences", last)
+    assert int(last.split()[0]) >= 3
+
+
+@pytest.mark.long
+def test_a_campaign_over_every_kind_of_run_finds_no_difference() -> None:
+    assert campaign("--kills", "6", "--each").endswith(" kills, 0 differences")

@@ -20,7 +20,7 @@ import numpy as np
 
 from merl.core.statistics import wilson_interval
 from merl.envs import make_env
-from merl.envs.expert import ExpertPolicy
+from merl.envs.expert_policy import ExpertPolicy
 from merl.evaluation.evaluation import EVALUATION_SEED
 
 OUTPUT = Path(__file__).resolve().parent.parent / "results/expert.csv"

@@ -38,8 +38,8 @@ from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from merl.accelerate.cuda_graph import Recorded, UpdateOnDevice
 from merl.accelerate.device_replay import DeviceReplay
-from merl.accelerate.recording import Recorded, UpdateOnDevice
 from merl.accelerate.twins import join_heads
 from merl.agents.ddpg import DDPG
 from merl.bench import train, update

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from merl.envs import EnvConfig, make_env
-from merl.envs.expert import ExpertPolicy
+from merl.envs.expert_policy import ExpertPolicy
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.report.references import form
 from merl.tasks import BOX_TASKS, TASKS

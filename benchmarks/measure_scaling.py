@@ -40,7 +40,7 @@ from merl.core import Transition
 from merl.core.resources import free_disk
 from merl.envs import make_env
 from merl.networks.augmentation import RandomShift, draw_shifts
-from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, buffer, frames
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, buffer, stack_reader
 from merl.report.drawing import BLUE, DPI, GREEN, MUTED, VERMILION, new_figure, save, style
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -154,7 +154,7 @@ def _samples(replay: ReplayBuffer, rng: np.random.Generator) -> None:
 
 
 def _without_read_ahead(sample: Work) -> None:
-    with patch.object(frames.ReadAhead, "is_wanted", False):
+    with patch.object(stack_reader.ReadAhead, "is_wanted", False):
         sample()
 
 

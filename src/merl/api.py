@@ -17,7 +17,7 @@ from merl.core import MerlError
 from merl.envs.user_env import MakeEnv, task_of
 from merl.evaluation.evaluation import Evaluation
 from merl.evaluation.policy import load_policy
-from merl.experiments.cloning import clone_first
+from merl.experiments.cloning_first import clone_first
 from merl.experiments.presets import compose, default_preset
 from merl.rendering.config import RendererName
 from merl.runs.resume import resume_request

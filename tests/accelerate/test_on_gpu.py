@@ -15,7 +15,7 @@ from gymnasium import spaces
 from torch import Tensor
 
 import merl
-from merl.accelerate.recording import UpdateFromHost
+from merl.accelerate.cuda_graph import UpdateFromHost
 from merl.agents import AGENTS, make_agent
 from merl.agents.ddpg import DDPG
 from merl.cli import main

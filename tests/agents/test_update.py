@@ -26,7 +26,7 @@ from bridge import (
 from torch import Tensor
 
 from merl import modalities
-from merl.accelerate.networks import compile_forward, speed_up
+from merl.accelerate.speed_up import compile_forward, speed_up
 from merl.accelerate.twins import join_heads
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config

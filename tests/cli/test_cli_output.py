@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 
 
 def test_lines_are_not_wrapped_without_a_terminal(

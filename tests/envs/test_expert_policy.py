@@ -6,7 +6,7 @@ import pytest
 
 from merl.core import MerlError
 from merl.envs import make_env
-from merl.envs.expert import ExpertPolicy
+from merl.envs.expert_policy import ExpertPolicy
 from merl.evaluation.evaluation import evaluate
 
 

@@ -18,7 +18,7 @@ from merl.cli import main
 from merl.core import MerlError
 from merl.demos.demonstrations import Demonstrations
 from merl.envs import make_env
-from merl.envs.expert import HandMotion
+from merl.envs.expert_policy import HandMotion
 from merl.evaluation.teleoperation import PAIRS, Window, record_by_hand
 from toy import DotEnv
 

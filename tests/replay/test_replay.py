@@ -25,10 +25,10 @@ from hypothesis import strategies as st
 from helpers import wait_for
 from merl.accelerate.device_replay import DeviceReplay
 from merl.core import Batch, MerlError, Observation, Transition
-from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, check_fits, frames
-from merl.replay.frames import ReadAhead
+from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec, check_fits, stack_reader
 from merl.replay.ring import EpisodeRing
 from merl.replay.spec import KeySpec, span_name
+from merl.replay.stack_reader import ReadAhead
 
 IMAGES = {"front": (3, 4, 3), "wrist/left": (2, 2, 1)}
 OBSERVATIONS = gymnasium.spaces.Dict(
@@ -307,7 +307,7 @@ def test_read_ahead_requests_exactly_the_batch(tmp_path, monkeypatch, compress, 
 
 def test_read_ahead_is_active_for_some_batches_after_page_faults(monkeypatch):
     faults = 0
-    monkeypatch.setattr(frames, "_major_page_faults", lambda: faults)
+    monkeypatch.setattr(stack_reader, "_major_page_faults", lambda: faults)
     ahead = ReadAhead()
 
     def batch(pages):

@@ -11,8 +11,8 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from merl.accelerate.cuda_graph import UpdateFromHost, UpdateOnDevice
 from merl.accelerate.device_replay import DeviceReplay
-from merl.accelerate.recording import UpdateFromHost, UpdateOnDevice
 from merl.acting.environments import InProcessEnvs
 from merl.acting.rollout import Episode, Fetched, FrameStack, mean_metrics
 from merl.agents import make_agent

@@ -117,7 +117,7 @@ def test_a_failing_compilation_is_skipped_and_reported(monkeypatch: pytest.Monke
     def fail(*_: object) -> None:
         raise RuntimeError("no compiler\n  at all")
 
-    monkeypatch.setattr("merl.accelerate.networks.compile_networks", fail)
+    monkeypatch.setattr("merl.accelerate.speed_up.compile_networks", fail)
     monkeypatch.setattr(timing, "worth_compiling", lambda *_: True)
     env = DotEnv()
     env.length = 10_000

@@ -201,6 +201,9 @@ def test_a_policy_accepts_tensors_and_rejects_invalid_observations(tmp_path: Pat
     tensors = {key: torch.from_numpy(value) for key, value in observation.items()}
     tensors["joints"] = tensors["joints"].double().requires_grad_()
     np.testing.assert_array_equal(policy(tensors), action)  # type: ignore[arg-type]
+    policy.reset()
+    channels_first = {**observation, "pixels": np.moveaxis(observation["pixels"], -1, 0)}
+    np.testing.assert_array_equal(policy(channels_first), action)
     for key, value, message in (
         ("joints", [[1.0], [1.0, 2.0]], "cannot be converted"),
         ("joints", None, "'joints' contains a value that is not a number: None"),

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from merl.accelerate.networks import speed_up
+from merl.accelerate.speed_up import speed_up
 from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack
 from merl.acting.run_env import make_run_env, run_spaces, run_spec

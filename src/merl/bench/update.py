@@ -20,9 +20,9 @@ from gymnasium import spaces
 from rich.table import Table
 from torch import Tensor
 
+from merl.accelerate.cuda_graph import Recorded, UpdateOnDevice
 from merl.accelerate.device_replay import DeviceReplay
-from merl.accelerate.networks import speed_up
-from merl.accelerate.recording import Recorded, UpdateOnDevice
+from merl.accelerate.speed_up import speed_up
 from merl.agents import AGENTS, make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG

@@ -14,7 +14,7 @@ import tyro
 from rich.console import Console
 
 from merl.acting.run_env import make_run_env, own_bounds, run_spaces
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import parse
 from merl.cli.run import Stop
 from merl.config import ActorsConfig, TrainConfig

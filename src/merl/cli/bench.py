@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from merl.bench import BENCHES
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import check_writable, parse, write_json
 from merl.core import check_choice
 from merl.core.fields import Range, check_fields

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import check_writable, parse
 from merl.core import MerlError
 from merl.core.fields import NOT_EMPTY, Range, check_fields

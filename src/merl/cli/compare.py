@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import parse
 from merl.core import CONFIG_FILE, MerlError
 from merl.report.collect import RETURN, SUCCESS, Group, SeedRun, read_run

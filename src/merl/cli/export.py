@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from rich.filesize import decimal
 
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import RunOptions, check_writable, parse
 from merl.cli.running import tell_trusted
 from merl.evaluation.export import export_policy

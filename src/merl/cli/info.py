@@ -10,7 +10,7 @@ from rich.table import Table
 
 import merl
 from merl.bench.renderers import renderer_speeds
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError, counted
 from merl.core.resources import available_memory, free_disk

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError, counted, suggest
 from merl.core.fields import Range, check_fields

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import RunOptions, parse
 from merl.cli.running import tell_trusted
 from merl.core import MerlError

@@ -21,7 +21,7 @@ from gymnasium import spaces
 from rich.console import Console
 
 from merl.acting.run_env import own_bounds
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import RunOptions, parse
 from merl.cli.running import tell_trusted
 from merl.core import MerlError, counted

@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.filesize import decimal
 
 from merl.acting.run_env import key_lines
+from merl.cli.console import make_console
 from merl.cli.duration import duration
-from merl.cli.output import make_console
 from merl.cli.summary import summarize
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import counted
-from merl.experiments.cloning import clone_first
+from merl.experiments.cloning_first import clone_first
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run

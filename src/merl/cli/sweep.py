@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import check_writable, parse
 from merl.core import MerlError, check_choice, counted, suggest
 from merl.core.fields import NOT_EMPTY, Range, check_fields

@@ -14,7 +14,7 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
-from merl.cli.output import make_console
+from merl.cli.console import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError
 from merl.envs import make_env

@@ -15,7 +15,7 @@ from merl.cli.parsing import parse
 from merl.cli.running import Damaged, begin, go_on
 from merl.config import ActorsConfig, Setting, Source, TrainConfig, flat
 from merl.core import CONFIG_FILE, MerlError
-from merl.experiments.cloning import starts_cloned
+from merl.experiments.cloning_first import starts_cloned
 from merl.experiments.presets import PRESETS, compose, default_preset
 from merl.link.protocol import PORT
 from merl.runs.resume import decided, left_open

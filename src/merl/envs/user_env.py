@@ -19,7 +19,7 @@ from gymnasium.envs.registration import registry
 from merl.core import MerlError, suggest, user_code
 from merl.core.user_code import in_one_line
 from merl.envs.config import UserEnvConfig
-from merl.envs.packages import installing
+from merl.envs.install_hints import installing
 from merl.envs.registration import ENV_IDS
 from merl.envs.wrappers import adapt, failing
 

@@ -40,9 +40,14 @@ class UserKey:
     channels_first: bool = False
 
     @classmethod
-    def as_trained(cls, key: str, modality: Modality) -> UserKey:
-        """Return the check of a key that needs no conversion."""
-        return cls(key, modality.space, modality)
+    def as_trained(cls, key: str, modality: Modality, shape: tuple[int, ...]) -> UserKey:
+        """Return the check of a key of shape `shape`; images may be (C, H, W), too."""
+        space = modality.space
+        first = (*space.shape[-1:], *space.shape[:-1])
+        if not isinstance(modality, Image) or shape != first or shape == space.shape:
+            return cls(key, space, modality)
+        low, high = (np.moveaxis(bound, -1, 0) for bound in (space.low, space.high))
+        return cls(key, spaces.Box(low, high, dtype=np.uint8), modality, channels_first=True)
 
     @cached_property
     def bounds(self) -> tuple[float, float]:

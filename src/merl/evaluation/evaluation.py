@@ -19,7 +19,7 @@ from merl.config import EvaluationConfig
 from merl.core import Observation
 from merl.core.guards import check_finite
 from merl.core.statistics import Interval, bootstrap_interval, wilson_interval
-from merl.evaluation.recording import EpisodeVideo, warn_user
+from merl.evaluation.episode_video import EpisodeVideo, warn_user
 
 EVALUATION_SEED = 1_000_000
 """Episode i of every evaluation starts with `env.reset(seed=EVALUATION_SEED + i)`."""

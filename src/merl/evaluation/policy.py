@@ -22,6 +22,7 @@ from merl.config import TrainConfig
 from merl.core import Agent, MerlError, NotFinite, Observation
 from merl.envs.user_env import MakeEnv
 from merl.envs.user_spaces import UserKey
+from merl.envs.user_values import to_array
 from merl.evaluation.evaluation import Evaluation, evaluate
 from merl.evaluation.video import MIN_SIDE
 from merl.modalities import Modality, modalities_of
@@ -72,7 +73,7 @@ class Policy:
 
         Args:
             observation: an observation of the environment, with the types and shapes of training
-                (merl.modalities).
+                (merl.modalities); images (H, W, C) or (C, H, W).
 
         Returns:
             The action, float32 (A,), in [-1, 1].
@@ -199,7 +200,8 @@ def checked(key: str, modality: Modality, observation: Observation) -> NDArray[A
         )
     if key not in observation:
         raise MerlError(f"the observation lacks {key!r}: it has {list(observation)}")
-    value = UserKey.as_trained(key, modality).convert(observation[key])
+    given = to_array(f"observation {key!r}", observation[key])
+    value = UserKey.as_trained(key, modality, given.shape).convert(given)
     if not np.isfinite(value).all():
         raise NotFinite(f"observation {key!r} contains NaN or infinity: {value}")
     return value

@@ -18,10 +18,10 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from merl.core import MerlError
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode
-from merl.envs.success import SHAPES
+from merl.envs.learnt_success import SHAPES
 from merl.modalities import Image, modalities_of
 from merl.networks.augmentation import draw_shifts, shift
-from merl.networks.success import SuccessNetwork
+from merl.networks.success_classifier import SuccessNetwork
 
 LEARNING_RATE = 1e-3
 BATCH = 64
@@ -187,6 +187,6 @@ def _report(network: SuccessNetwork, data: Labelled, threshold: float) -> Report
 
 
 def save_classifier(network: SuccessNetwork, data: Labelled, file: Path) -> None:
-    """Write a classifier, for `merl.envs.success.LearntSuccess`."""
+    """Write a classifier, for `merl.envs.learnt_success.LearntSuccess`."""
     shapes = {key: values.shape[1:] for key, values in data.images.items()}
     save_file(network.state_dict(), file, {SHAPES: json.dumps(shapes)})

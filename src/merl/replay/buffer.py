@@ -22,11 +22,11 @@ from merl.core import Batch, FrameTransforms, MerlError, Observation, Transition
 from merl.replay.capacity import check_fits
 from merl.replay.compression import CompressedFrames
 from merl.replay.damage import JOURNAL, find_damage
-from merl.replay.frames import RawFrames, ReadAhead, copy_stacks, copy_unchanged
 from merl.replay.journal import Journal
 from merl.replay.ring import EpisodeRing
 from merl.replay.sampling import SampleIndices, Sampler
 from merl.replay.spec import ReplaySpec, field_name, span_name
+from merl.replay.stack_reader import RawFrames, ReadAhead, copy_stacks, copy_unchanged
 from merl.replay.storage import Storage, in_memory, new_files, open_files
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from merl.report.aggregates import Array, performance_profile, profile_band
 from merl.report.drawing import (
     DASHES,
     MUTED,
@@ -18,7 +19,6 @@ from merl.report.drawing import (
     style,
     value_axis,
 )
-from merl.report.statistics import Array, performance_profile, profile_band
 
 
 def draw_profiles(scores: Mapping[str, Array], output: Path) -> Path:

@@ -12,9 +12,7 @@ import numpy as np
 
 from merl.core import MerlError
 from merl.core.statistics import Interval, bootstrap_interval
-from merl.report.collect import RETURN, SUCCESS, Group, SeedRun
-from merl.report.references import EXPERT, RANDOM
-from merl.report.statistics import (
+from merl.report.aggregates import (
     Array,
     interquartile_mean,
     optimality_gap,
@@ -22,6 +20,8 @@ from merl.report.statistics import (
     probability_of_improvement,
     stratified_interval,
 )
+from merl.report.collect import RETURN, SUCCESS, Group, SeedRun
+from merl.report.references import EXPERT, RANDOM
 
 SECONDS = "time/seconds"
 LEVELS = (0.5, 0.8)

@@ -14,7 +14,7 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
-from merl.accelerate.networks import speed_up
+from merl.accelerate.speed_up import speed_up
 from merl.acting.env_checks import check_instances
 from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec

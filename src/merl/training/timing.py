@@ -19,8 +19,8 @@ import gymnasium
 import torch
 from gymnasium import spaces
 
-from merl.accelerate.networks import speed_up
-from merl.accelerate.recording import Recorded
+from merl.accelerate.cuda_graph import Recorded
+from merl.accelerate.speed_up import speed_up
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
 from merl.config import TrainConfig

@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from merl.accelerate.cuda_graph import UpdateFromHost, UpdateOnDevice
 from merl.accelerate.device_replay import DeviceReplay, bytes_on_device
-from merl.accelerate.recording import UpdateFromHost, UpdateOnDevice
 from merl.config import TrainConfig
 from merl.core import Accelerable, Agent
 from merl.networks.settings import torch_settings

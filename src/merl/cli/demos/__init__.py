@@ -10,10 +10,10 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from merl.cli.console import make_console
 from merl.cli.demos.convert import ExportOptions, ImportOptions, export, import_
 from merl.cli.demos.record import RecordOptions, record
 from merl.cli.demos.shared import FolderOptions, describe
-from merl.cli.output import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError, suggest
 from merl.demos.demonstrations import Demonstrations

@@ -11,8 +11,8 @@ import tyro
 from gymnasium import spaces
 
 from merl.acting.run_env import own_bounds
+from merl.cli.console import make_console
 from merl.cli.demos.shared import EnvOptions, FolderOptions, describe, make, tell_line, with_env
-from merl.cli.output import make_console
 from merl.cli.parsing import parse
 from merl.core import MerlError, check_choice, counted
 from merl.core.fields import Range, check_fields

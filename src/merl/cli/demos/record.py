@@ -11,14 +11,14 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from merl.cli.console import make_console
 from merl.cli.demos.shared import EnvOptions, describe, make, tell_line, with_env
-from merl.cli.output import make_console
 from merl.core import MerlError
 from merl.core.fields import Range
 from merl.demos.episode import Episode
 from merl.demos.recorder import Recorder
 from merl.envs.config import EnvConfig, UserEnvConfig
-from merl.envs.expert import ExpertPolicy, HandMotion
+from merl.envs.expert_policy import ExpertPolicy, HandMotion
 from merl.envs.frame_rate import frame_rate
 from merl.envs.registration import ENV_IDS
 from merl.envs.user_env import check_task

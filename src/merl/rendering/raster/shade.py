@@ -6,7 +6,7 @@
 
 import warp as wp
 
-from merl.rendering.raster.sampling import in_shadow_map, lit_share, sample_texture, sky
+from merl.rendering.raster.lookup import in_shadow_map, lit_share, sample_texture, sky
 from merl.rendering.raster.structs import Background, Light, Material, Shadowed, Surfaces, View
 
 wp.set_module_options({"enable_backward": False})

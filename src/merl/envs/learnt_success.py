@@ -13,7 +13,7 @@ from gymnasium import spaces
 from merl.core import MerlError
 
 if TYPE_CHECKING:
-    from merl.networks.success import SuccessNetwork
+    from merl.networks.success_classifier import SuccessNetwork
 
 SHAPES = "shapes"
 """Name of the images' shapes in the metadata of a classifier's file."""
@@ -28,7 +28,7 @@ def load_classifier(file: Path) -> tuple[SuccessNetwork, dict[str, tuple[int, ..
     import torch
     from safetensors import SafetensorError, safe_open
 
-    from merl.networks.success import SuccessNetwork
+    from merl.networks.success_classifier import SuccessNetwork
 
     try:
         with safe_open(file, "pt") as opened:

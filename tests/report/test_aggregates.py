@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from merl.report.statistics import (
+from merl.report.aggregates import (
     interquartile_mean,
     optimality_gap,
     paired_test,

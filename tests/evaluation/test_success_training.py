@@ -15,7 +15,7 @@ from merl.core import MerlError
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode
 from merl.demos.recorder import Recorder
-from merl.envs.success import LearntSuccess
+from merl.envs.learnt_success import LearntSuccess
 from merl.evaluation.demonstrating import record_episodes
 from merl.evaluation.success_training import label
 from toy import DotEnv

@@ -43,6 +43,14 @@ class Preset:
     for_user_env: Mapping[str, Any] = field(default_factory=dict)
 
 
+_SMALL: dict[str, Any] = {
+    "learning_rate": 3e-4,
+    "hidden_dim": 256,
+    "actor_average": 0.001,
+    "learning_rate_end": 1e-4,
+    "learning_rate_steps": 400_000,
+}
+"""Values of a learner for a processor, whatever it observes (docs/explanation/laptop.md)."""
 _LAPTOP = Preset(
     "made for 2 cores without a GPU: learns in half an hour",  # docs/explanation/laptop.md
     TrainConfig(
@@ -57,15 +65,7 @@ _LAPTOP = Preset(
         replay=ReplayConfig(batch_size=128, frame_stack=2),
         eval=EvaluationConfig(every=40_000, episodes=10, video="last"),
     ),
-    {
-        "learning_rate": 3e-4,
-        "conv_strides": (2, 2, 1),
-        "shift_pad": 1,
-        "hidden_dim": 256,
-        "actor_average": 0.001,
-        "learning_rate_end": 1e-4,
-        "learning_rate_steps": 400_000,
-    },
+    {**_SMALL, "conv_strides": (2, 2, 1), "shift_pad": 1},
     for_user_env={
         "steps": 150_000,
         "random_steps": 1000,
@@ -117,7 +117,7 @@ PRESETS: dict[str, Preset] = {
             replay=ReplayConfig(batch_size=128),
             eval=EvaluationConfig(every=20_000, episodes=20, video="last"),
         ),
-        {"hidden_dim": 256, "learning_rate": 3e-4, "standardize": True, "precision": "fp32"},
+        {**_SMALL, "standardize": True, "precision": "fp32"},
         "merl_state",
         for_user_env={"random_steps": 5000, "seed_steps": 5000, "updates_per_step": 1.0},
     ),

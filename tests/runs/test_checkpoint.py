@@ -15,7 +15,8 @@ from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SACConfig
 from merl.core import Batch, MerlError
-from merl.runs.checkpoint import Checkpoint, _fingerprint, discard_later, load_agent, save
+from merl.runs.checkpoint import Checkpoint, _fingerprint, load_agent, save
+from merl.runs.checkpoint_folders import discard_later
 from toy import DotEnv
 
 CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")

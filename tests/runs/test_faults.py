@@ -186,7 +186,10 @@ def sweep(part: int = 0, parts: int = 1) -> int:
             found = every.problem(case)
             if found is not None:
                 problems += 1
-                print(f"--- {number} of {len(cases)}: {case}, {errno.errorcode[case.code]}: {found}", flush=True)
+                print(
+                    f"--- {number} of {len(cases)}: {case}, {errno.errorcode[case.code]}: {found}",
+                    flush=True,
+                )
         print(f"{problems} problems in {len(cases)} cases")
         return problems
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.core.files import cause, is_gone, open_file, read_file, reporting
+from merl.core.files import cause, is_gone, open_file, read_file, replace_file, reporting
 from merl.replay.spec import Field
 
 STAGES = (1, 5, 25)
@@ -95,6 +95,15 @@ class Backgrounds:
         if self._file is not None and not is_gone(self._file):
             with reporting(f"{self._file} cannot be written"):
                 os.truncate(self._file, frames * self._field.bytes)
+
+    def write_again(self) -> None:
+        """Write the file of the first frames, which was removed.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        assert self._file is not None
+        replace_file(self._file, *(frame.tobytes() for frame in self._first))
 
     def _medians(self) -> list[NDArray[Any]]:
         black = np.zeros(self._field.shape, self._field.dtype).reshape(-1)

@@ -32,7 +32,7 @@ from merl.core.files import (
     replace_file,
     reporting,
 )
-from merl.core.resources import reserve_file
+from merl.core.resources import reserve_file, reserve_holes
 from merl.replay.spec import ReplaySpec
 
 _HEADER, _PART = "replay.json", "part"
@@ -161,9 +161,17 @@ def _mapped(folder: Path, spec: ReplaySpec, slots: int, access: int = mmap.ACCES
     for name, field in spec.fields.items():
         size = spec.rings * slots * field.bytes
         with open_file(folder / f"{name}.bin", mode) as file:
+            if access == mmap.ACCESS_WRITE:
+                reserve_holes(file.fileno())
             files[name] = mmap.mmap(file.fileno(), size, access=access)
         arrays[name] = np.frombuffer(files[name], field.dtype).reshape(-1, *field.shape)
     return Storage(slots, arrays, files)
+
+
+def is_lost(directory: Path, storage: Storage) -> bool:
+    """Return whether a file of a replay was removed, so that only its memory map exists."""
+    folder = directory / str(storage.slots)
+    return any(is_gone(folder / name) for name in (_HEADER, *(f"{n}.bin" for n in storage.files)))
 
 
 def _remove_others(folder: Path) -> None:

@@ -105,7 +105,8 @@ def create_folder(config: TrainConfig, source: Source, home: Path | None) -> tup
     """
     while True:
         path = run_path(config, source, home)
-        refuse_existing(path)
+        if config.run_dir is not None:
+            refuse_existing(path)
         try:
             path.mkdir(parents=True)
         except FileExistsError:

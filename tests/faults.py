@@ -16,9 +16,10 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn, TextIO
 
 _AUDITED = {
     "open": (0,),
@@ -148,14 +149,11 @@ class Faults:
 
 def _path(path: Any) -> str:
     """Return the absolute path of a path or of a descriptor; nothing for any other argument."""
-    if isinstance(path, int):
-        try:
-            return os.readlink(f"/proc/self/fd/{path}")
-        except OSError:
-            return ""
     try:
-        return os.path.abspath(os.fsdecode(path))
-    except TypeError:
+        if isinstance(path, int):
+            return str(Path(f"/proc/self/fd/{path}").readlink())
+        return str(Path.cwd() / os.fsdecode(path))
+    except (OSError, TypeError):
         return ""
 
 
@@ -170,41 +168,32 @@ class Ended(NamedTuple):
 
 def with_faults(action: Callable[[], int], faults: Faults | None = None) -> Ended:
     """Run `action`, which returns an exit code, in a child process with faults."""
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        read, write = os.pipe()
+    with ExitStack() as stack:
+        out, err, names = (stack.enter_context(tempfile.TemporaryFile("w+")) for _ in range(3))
         pid = os.fork()
         if pid == 0:
-            os.close(read)
-            os.dup2(out.fileno(), 1)
-            os.dup2(err.fileno(), 2)
-            _run(action, faults, write)
-        os.close(write)
-        with open(read, "rb") as pipe:
-            names = pipe.read().decode()
+            _run(action, faults or Faults(Path(os.devnull)), out, err, names)
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        out.seek(0)
-        err.seek(0)
-        return Ended(code, out.read().decode(), err.read().decode(), names.splitlines())
+        for file in (out, err, names):
+            file.seek(0)
+        return Ended(code, out.read(), err.read(), names.read().splitlines())
 
 
-def _run(action: Callable[[], int], faults: Faults | None, report: int) -> None:
-    """Run the action and end this process."""
-    sys.stdout = io.TextIOWrapper(io.FileIO(1, "w", closefd=False), line_buffering=True)
-    sys.stderr = io.TextIOWrapper(io.FileIO(2, "w", closefd=False), line_buffering=True)
+def _run(
+    action: Callable[[], int], faults: Faults, out: TextIO, err: TextIO, names: TextIO
+) -> NoReturn:
+    """Run the action, with its output in files, and end this process."""
+    os.dup2(out.fileno(), 1)
+    os.dup2(err.fileno(), 2)
+    sys.stdout, sys.stderr = out, err
     code = 70
     try:
-        if faults is not None:
-            faults.install()
+        faults.install()
         code = action()
-    except SystemExit as ended:
-        code = ended.code if isinstance(ended.code, int) else 1
     except BaseException:
         traceback.print_exc()
     finally:
-        if faults is not None:
-            os.pipe  # the descriptors stay
-            with open(report, "wb") as pipe:
-                pipe.write("\n".join(faults.names).encode())
-        sys.stdout.flush()
-        sys.stderr.flush()
+        names.write("\n".join(faults.names))
+        for file in (out, err, names):
+            file.flush()
         os._exit(code)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import errno
-import os
+import itertools
 import re
 import shutil
 import sys
@@ -13,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
 import torch
 from safetensors.torch import load_file
 
@@ -42,12 +42,8 @@ _FLAGS = {
     "--eval.episodes": 1,
     "--eval.video": "none",
 }
-LESS_EXACT = (
-    "the replay has overwritten",
-    "resuming loses the oldest steps of the replay",
-    "the run continues without it",
-)
-"""Lines that tell that a resumed run continues, but not bit for bit."""
+LESS_EXACT = ("not bit-exactly", "resuming loses the oldest steps of the replay")
+"""What a run says that is no longer the same, bit for bit, as an uninterrupted one."""
 
 
 class Case(NamedTuple):
@@ -67,90 +63,91 @@ def line(run: Path, steps: int = STEPS) -> list[str]:
     return ["train", "merl.envs.dot:whole", *words, "--eval.no-references"]
 
 
-def prepare() -> None:
-    """Import what a run imports, and leave out timing and drawing."""
-    torch.set_num_threads(1)
+def run_merl(arguments: list[str], state: Path) -> int:
+    """Run merl without timing and drawing; `state` takes the place of the home folder's."""
     timing = Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
-    merl.training.setup.measure = lambda *_: timing  # type: ignore[assignment]
-    merl.report.figures.learning_curve = lambda run, to, **_: to  # type: ignore[assignment]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(state))
+        patch.setattr(merl.training.setup, "measure", lambda *_: timing)
+        patch.setattr(merl.report.figures, "learning_curve", lambda run, to, **_: to)
+        return main(arguments)
 
 
 class Sweep:
-    """A reference run, a half of it, and the operations of both."""
+    """A reference run, a half of it, and runs whose file operations fail.
+
+    Args:
+        folder: an empty folder for them.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.base = folder, folder / "case"
-        self.run = self.base / "run"
-        os.environ["XDG_STATE_HOME"] = str(self.base / "state")
+        self.run, self.state = self.base / "run", self.base / "state"
+        self._operations: dict[tuple[bool, bool], list[str]] = {}
         self.base.mkdir()
-        assert main(line(self.run)) == 0  # so that everything is imported
+        torch.set_num_threads(1)
+        assert run_merl(line(self.run), self.state) == 0  # so that everything is imported
         self.reference = weights(self.run)
-        shutil.rmtree(self.run)
-        self.names = {}
-        for writing in (False, True):
-            faults = Faults(self.base, writing=writing)
-            self.names[False, writing] = self.train(faults).names
-            shutil.rmtree(self.run)
-        assert with_faults(lambda: main(line(self.run, HALF))).code == 0
+        self.run.rename(folder / "whole")
+        assert run_merl(line(self.run, HALF), self.state) == 0
         self.run.rename(folder / "half")
-        for writing in (False, True):
-            self.restore_half()
-            faults = Faults(self.base, writing=writing)
-            self.names[True, writing] = self.resume(faults).names
 
-    def restore_half(self) -> None:
-        shutil.rmtree(self.run, ignore_errors=True)
-        shutil.copytree(self.folder / "half", self.run)
-
-    def train(self, faults: Faults | None = None) -> Ended:
-        return with_faults(lambda: main(line(self.run)), faults)
+    def start(self, resumes: bool, faults: Faults | None = None) -> Ended:
+        """Start a new run, or the half of one that resumes."""
+        shutil.rmtree(self.base)
+        self.base.mkdir()
+        if resumes:
+            shutil.copytree(self.folder / "half", self.run)
+            return self.resume(faults)
+        return with_faults(lambda: run_merl(line(self.run), self.state), faults)
 
     def resume(self, faults: Faults | None = None) -> Ended:
-        return with_faults(lambda: main(["resume", str(self.run), "--steps", str(STEPS)]), faults)
+        arguments = ["resume", str(self.run), "--steps", str(STEPS)]
+        return with_faults(lambda: run_merl(arguments, self.state), faults)
+
+    def operations(self, resumes: bool, writing: bool) -> list[str]:
+        """Return the operations of a run without faults."""
+        if (resumes, writing) not in self._operations:
+            faults = Faults(self.base, writing=writing)
+            self._operations[resumes, writing] = self.start(resumes, faults).names
+        return self._operations[resumes, writing]
 
     def cases(self) -> Iterator[Case]:
-        """Yield the first, the middle and the last operation of each kind, with each error."""
-        number = 0
-        for (resumes, writing), names in self.names.items():
+        """Yield the first, the middle and the last operation of each kind, with changing errors."""
+        codes = itertools.cycle(CODES)
+        refusals = itertools.cycle([errno.EROFS, errno.ENOSPC])
+        for resumes, writing in itertools.product((False, True), repeat=2):
+            names = self.operations(resumes, writing)
             kinds: dict[str, list[int]] = {}
             for at, name in enumerate(names, 1):
                 kinds.setdefault(re.sub(r"\d+", "N", name), []).append(at)
             for places in kinds.values():
                 for at in sorted({places[0], places[len(places) // 2], places[-1]}):
-                    for lasts in (False, True):
-                        code = CODES[number % len(CODES)]
-                        number += 1
-                        if writing and (not lasts or code in (errno.EIO, errno.ESTALE)):
-                            code = (errno.EROFS, errno.ENOSPC)[number % 2]
-                            if not lasts:
-                                continue
-                        yield Case(resumes, at, names[at - 1], code, lasts, writing)
+                    if not writing:
+                        yield Case(resumes, at, names[at - 1], next(codes), False, False)
+                    code = next(refusals if writing else codes)
+                    yield Case(resumes, at, names[at - 1], code, True, writing)
 
     def problem(self, case: Case) -> str | None:
-        """Run a case; return what is wrong with it."""
-        shutil.rmtree(self.base)
-        self.base.mkdir()
+        """Run a case, then resume it on a good disk; return what is wrong, if anything is."""
         faults = Faults(self.base, case.at, case.code, case.lasts, case.writing)
-        if case.resumes:
-            self.restore_half()
-            ended = self.resume(faults)
-        else:
-            ended = self.train(faults)
+        ended = self.start(case.resumes, faults)
         if (why := wrong(ended)) is not None:
             return f"{why}\n{ended.err}{ended.out[-400:]}"
         told = ended.out + ended.err
-        then = None
         if ended.code != 0 or not case.resumes:
-            then = self.resume() if (self.run / "config.json").exists() else self.train()
+            then = self.resume() if (self.run / "config.json").exists() else self.start(False)
             if then.code != 0:
                 return f"then {then.code}: {then.err}\nafter {ended.code}: {ended.err}"
             told += then.out + then.err
-        told = " ".join(told.split())
-        if not same(weights(self.run), self.reference):
-            if not any(text in told for text in LESS_EXACT):
-                return f"other weights\n{told}"
+        if same(weights(self.run), self.reference) or is_told(told):
             return None
-        return None
+        return f"other weights\n{told}"
+
+
+def is_told(printed: str) -> bool:
+    """Return whether a run has told that it is not the same as an uninterrupted one."""
+    return any(text in " ".join(printed.split()) for text in LESS_EXACT)
 
 
 def wrong(ended: Ended) -> str | None:
@@ -175,24 +172,50 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
     return one.keys() == other.keys() and all(one[name].equal(other[name]) for name in one)
 
 
-def sweep(part: int = 0, parts: int = 1) -> int:
-    """Run the cases; print and count the problems."""
-    prepare()
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Sweep:
+    return Sweep(tmp_path_factory.mktemp("faults"))
+
+
+SAMPLE = [
+    (False, "write run/checkpoints/.part-00000080/learner.pt", errno.EROFS, True),
+    (False, "stat run/config.json", errno.ESTALE, True),
+    (False, "write run/replay/overwritten.journal", errno.ENOSPC, False),
+    (True, "mmap.__new__ run/replay/53/reward.bin", errno.EIO, True),
+    (True, "read run/checkpoints/00000060/manifest.json", errno.ESTALE, False),
+]
+
+
+@pytest.mark.parametrize(("resumes", "name", "code", "lasts"), SAMPLE, ids=lambda value: str(value))
+def test_a_run_survives_a_failing_operation(
+    sweep: Sweep, resumes: bool, name: str, code: int, lasts: bool
+) -> None:
+    names = sweep.operations(resumes, writing=False)
+    at = len(names) - names[::-1].index(name)  # the last one
+    assert sweep.problem(Case(resumes, at, name, code, lasts, writing=False)) is None
+
+
+@pytest.mark.long
+@pytest.mark.timeout(10_000)
+def test_a_run_survives_every_failing_operation(sweep: Sweep) -> None:
+    problems = [(case, found) for case in sweep.cases() if (found := sweep.problem(case))]
+    assert problems == []
+
+
+def main_of_a_part(part: int, parts: int) -> int:
+    """Run a part of all cases; print and count the problems."""
     with tempfile.TemporaryDirectory() as folder:
-        every = Sweep(Path(folder))
-        cases = list(every.cases())[part::parts]
+        sweep = Sweep(Path(folder))
+        cases = [*sweep.cases()][part::parts]
         problems = 0
         for number, case in enumerate(cases):
-            found = every.problem(case)
-            if found is not None:
+            if (found := sweep.problem(case)) is not None:
                 problems += 1
-                print(
-                    f"--- {number} of {len(cases)}: {case}, {errno.errorcode[case.code]}: {found}",
-                    flush=True,
-                )
+                code = errno.errorcode[case.code]
+                print(f"--- {number} of {len(cases)}: {case}, {code}: {found}", flush=True)
         print(f"{problems} problems in {len(cases)} cases")
         return problems
 
 
 if __name__ == "__main__":
-    sys.exit(sweep(int(sys.argv[1]), int(sys.argv[2])) > 0)
+    sys.exit(main_of_a_part(int(sys.argv[1]), int(sys.argv[2])) > 0)

@@ -22,6 +22,7 @@ import merl.report.figures
 import merl.training.setup
 from faults import Ended, Faults, with_faults
 from merl.cli import main
+from merl.runs import checkpoint
 from merl.training.timing import Arithmetic, Timing
 
 CODES = (errno.EROFS, errno.EIO, errno.ESTALE, errno.EACCES, errno.ENOSPC)
@@ -195,6 +196,30 @@ def test_a_run_survives_a_failing_operation(
     assert sweep.problem(Case(resumes, at, name, code, lasts, writing=False)) is None
 
 
+def test_a_run_whose_replay_is_removed_writes_it_again(sweep: Sweep) -> None:
+    write = checkpoint.save
+
+    def save_and_remove(root: Path, step: int, *args: Any, **options: Any) -> Any:
+        saved = write(root, step, *args, **options)
+        if step == HALF + 20:
+            shutil.rmtree(root.parent / "replay")
+        return saved
+
+    def train() -> int:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(checkpoint, "save", save_and_remove)
+            return run_merl(line(sweep.run), sweep.state)
+
+    shutil.rmtree(sweep.base)
+    sweep.base.mkdir()
+    ended = with_faults(train)
+    assert ended.code == 0, ended.err
+    assert ended.err.count("was removed: it is written again") == 1
+    assert same(weights(sweep.run), sweep.reference)
+    arguments = ["resume", str(sweep.run), "--steps", str(STEPS + 40)]
+    assert with_faults(lambda: run_merl(arguments, sweep.state)).code == 0
+
+
 @pytest.mark.long
 @pytest.mark.timeout(10_000)
 def test_a_run_survives_every_failing_operation(sweep: Sweep) -> None:
@@ -202,7 +227,7 @@ def test_a_run_survives_every_failing_operation(sweep: Sweep) -> None:
     assert problems == []
 
 
-def main_of_a_part(part: int, parts: int) -> int:
+def run_part(part: int, parts: int) -> int:
     """Run a part of all cases; print and count the problems."""
     with tempfile.TemporaryDirectory() as folder:
         sweep = Sweep(Path(folder))
@@ -218,4 +243,4 @@ def main_of_a_part(part: int, parts: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main_of_a_part(int(sys.argv[1]), int(sys.argv[2])) > 0)
+    sys.exit(run_part(int(sys.argv[1]), int(sys.argv[2])) > 0)

@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from merl.callbacks import Callback
 from merl.core import MerlError, check_choice
+from merl.core.files import append_whole
 from merl.core.user_code import reason
 from merl.evaluation.evaluation import Evaluation
-from merl.runs.metrics import MetricsFile, append_whole
+from merl.runs.metrics import MetricsFile
 from merl.runs.plain import to_plain
 
 if TYPE_CHECKING:

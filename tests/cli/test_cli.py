@@ -654,6 +654,21 @@ def test_a_damaged_config_is_reported_in_one_line(  # type: ignore[no-untyped-de
         assert message in error
 
 
+@pytest.mark.parametrize("traceback", ["", "1"])
+def test_an_error_of_the_disk_that_no_code_expects_is_one_line(
+    traceback: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: list[str]) -> int:
+        raise OSError(116, "Stale file handle", "/data/file")
+
+    monkeypatch.setattr("merl.cli.tasks.tasks", fail)
+    monkeypatch.setenv("MERL_TRACEBACK", traceback)
+    assert main(["tasks"]) == 2
+    *others, last = capsys.readouterr().err.splitlines()
+    assert last == "merl: error: /data/file: Stale file handle"
+    assert bool(others) == bool(traceback)
+
+
 def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     assert main(["--version"]) == 0

@@ -161,3 +161,11 @@ class DeviceTensor:
 
 def test_tensors_on_a_device_are_copied_to_the_host() -> None:
     np.testing.assert_array_equal(to_array("x", DeviceTensor()), np.ones(3))
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\rb", "\x1b[31m"])
+def test_a_reward_term_needs_a_name_for_a_column(name: str) -> None:
+    with pytest.raises(EnvironmentFailed, match="cannot be printed in its name") as caught:
+        to_info({"reward_terms": {"near": 1.0, name: 0.5}})
+    assert str(caught.value).isprintable()
+    assert to_info({"reward_terms": {'näher, "x"': 0.5}})["reward_terms"]

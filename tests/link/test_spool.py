@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from gymnasium import spaces
 
+from faults import Faults, with_faults
 from merl.acting.rollout import Episode
 from merl.core import MerlError, Transition
 from merl.link.spool import Spool
@@ -139,3 +142,41 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(MerlError, match="cannot be used"), Spool.open(tmp_path / "file"):
         pass
+
+
+@pytest.mark.parametrize("lasts", [False, True])
+def test_a_failing_disk_is_one_line_and_loses_no_timestep(tmp_path: Path, lasts: bool) -> None:
+    kept = tmp_path / "kept"  # the number of timesteps that were written
+
+    def act() -> int:
+        try:
+            with Spool.open(tmp_path / "spool") as spool:
+                spool.belong_to("run")
+                spool.start(0, LAYOUT.size, LAYOUT.number)
+                for _ in range(3):
+                    fill(spool, 1)
+                    kept.write_text(str(spool.last))
+                    spool.sync()
+                    spool.read(1, 3)
+                spool.discard(0)
+                fill(spool, 1)
+                kept.write_text(str(spool.last))
+                spool.finish()
+        except MerlError as error:
+            print(error)
+            return error.exit_code
+        return 0
+
+    count = len(with_faults(act, Faults(tmp_path / "spool")).names)
+    for at in range(1 + lasts, count + 1, 2):
+        shutil.rmtree(tmp_path / "spool", ignore_errors=True)
+        kept.write_text("0")
+        done = with_faults(act, Faults(tmp_path / "spool", at, errno.EIO, lasts))
+        assert done.code in (0, 2), done.err
+        assert done.out.count("\n") == (done.code != 0)
+        with Spool.open(tmp_path / "spool") as spool:
+            spool.belong_to("run")
+            spool.start(0, LAYOUT.size, LAYOUT.number)
+            assert spool.last >= int(kept.read_text())
+            if spool.last:
+                assert numbers(spool.read(1, 9)) == [*range(1, min(spool.last, 3) + 1)]

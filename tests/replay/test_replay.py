@@ -565,7 +565,7 @@ def test_full_disk_stops_the_journal_but_not_the_replay(tmp_path, caplog):
     run.replay.confirm_checkpoint()
     run.replay._journal._file = Full(run.replay._journal._file)
     run.play(9, 2)
-    assert caplog.text.count("the disk is full") == 1
+    assert caplog.text.count("journal: No space left on device; until") == 1
     run.restore(state, timesteps)  # only steps that the ring still holds
     check(run.replay, run.account)
     assert 0 < len(run.replay) < 18

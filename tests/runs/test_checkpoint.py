@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import errno
 import json
 import logging
+import shutil
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -9,13 +11,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from faults import Faults, with_faults
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SACConfig
 from merl.core import Batch, MerlError
-from merl.runs.checkpoint import Checkpoint, _fingerprint, discard_later, load_agent, save
+from merl.runs.checkpoint import Checkpoint, _fingerprint, load_agent, save
+from merl.runs.checkpoint_folders import discard_later
 from toy import DotEnv
 
 CONFIG = MERLConfig(latent_dim=8, hidden_dim=16, precision="fp32")
@@ -113,6 +117,45 @@ def test_a_second_save_that_fails_at_the_rename_keeps_the_first(
     with pytest.raises(OSError, match="Input/output"):
         save(tmp_path, 100, agent(), {"a": 2}, score=None, keep=1)
     assert Checkpoint.find(tmp_path).state() == {"a": 1}
+
+
+def test_a_checkpoint_that_was_to_be_replaced_is_found(tmp_path: Path) -> None:
+    """The process died between the two renames of the only checkpoint."""
+    save(tmp_path, 100, agent(), {"a": 1}, score=None, keep=1)
+    (tmp_path / "00000100").rename(tmp_path / ".former-00000100")
+    assert Checkpoint.find(tmp_path).state() == {"a": 1}
+    assert Checkpoint.find(tmp_path, "100").state() == {"a": 1}
+    save(tmp_path, 100, agent(), {"a": 2}, score=None, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["00000100"]
+    assert Checkpoint.find(tmp_path).state() == {"a": 2}
+
+
+def test_a_former_checkpoint_that_could_not_be_removed_is_no_obstacle(tmp_path: Path) -> None:
+    save(tmp_path, 100, agent(), {"a": 1}, score=None, keep=1)
+    shutil.copytree(tmp_path / "00000100", tmp_path / ".former-00000100")
+    save(tmp_path, 100, agent(), {"a": 2}, score=None, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["00000100"]
+    assert Checkpoint.find(tmp_path).state() == {"a": 2}
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.ESTALE, errno.EACCES])
+def test_a_checkpoint_that_the_disk_does_not_read_is_not_skipped(tmp_path: Path, code: int) -> None:
+    """It may be whole: resuming from the one before it would discard it."""
+    for step in (100, 200):
+        save(tmp_path, step, agent(), {}, score=None, keep=2)
+
+    def find() -> int:
+        try:
+            print(Checkpoint.find(tmp_path).step)
+        except MerlError as error:
+            print(error)
+        return 0
+
+    names = with_faults(find, Faults(tmp_path)).names
+    for at in range(1, len(names) + 1, 2):
+        out = with_faults(find, Faults(tmp_path, at, code)).out
+        assert "cannot be read: " in out, names[at - 1]
+        assert out.count("\n") == 1
 
 
 def test_resuming_before_a_damaged_checkpoint_keeps_the_good_ones(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -28,22 +29,32 @@ from merl.runs.checkpoint import Checkpoint
 SIZE = 24 * 2**20
 """Size of the disk in bytes: enough for a few checkpoints of the dot, its replay and its videos."""
 UNSHARE = ["unshare", "--map-root-user", "--mount"]
+OBEYS_MODES = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"]
+"""Root may otherwise write to a folder whatever its mode is."""
 
 
 def can_mount(folder: Path) -> bool:
-    mount = [*UNSHARE, "mount", "-t", "tmpfs", "tmpfs", str(folder)]
+    mount = [*UNSHARE, *OBEYS_MODES, "mount", "-t", "tmpfs", "tmpfs", str(folder)]
     try:
         return subprocess.run(mount, capture_output=True, check=False).returncode == 0
     except FileNotFoundError:
         return False
 
 
-@pytest.mark.parametrize("which", ["full", "full_to_the_end", "read_only"])
+@pytest.mark.parametrize(
+    "which",
+    [
+        "full",
+        "full_to_the_end",
+        "read_only",
+        *(pytest.param(which, marks=pytest.mark.long) for which in ("forbidden", "shared_memory")),
+    ],
+)
 def test_a_run_on_a_bad_disk(which: str, tmp_path: Path) -> None:
     if not can_mount(tmp_path):
         pytest.skip("this system does not allow users to mount a disk")
     done = subprocess.run(
-        [*UNSHARE, sys.executable, __file__, which, str(tmp_path)],
+        [*UNSHARE, *OBEYS_MODES, sys.executable, __file__, which, str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,
@@ -89,12 +100,25 @@ def mount(folder: Path, options: str = f"size={SIZE}") -> None:
 def full(folder: Path) -> None:
     """The run continues, reports the failed save, and loses nothing once there is space."""
     mount(folder)
-    run = folder / "run"
+    fails_for_a_while(folder / "run", lambda: fill(folder), (folder / "filler").unlink)
+
+
+def forbidden(folder: Path) -> None:
+    """The same with folders that nothing can be written to."""
+
+    def change(mode: int) -> None:
+        for each in (folder / "run", folder / "run/replay", folder / "run/checkpoints"):
+            each.chmod(mode)
+
+    fails_for_a_while(folder / "run", lambda: change(0o500), lambda: change(0o700))
+
+
+def fails_for_a_while(run: Path, spoil: Callable[[], object], mend: Callable[[], object]) -> None:
     often = ["--eval.every", "60", "--eval.video", "each"]
     process = start(line(run, *often, "--steps", "1000000", "--replay.capacity", "1000"))
     assert process.stdout is not None
     wait_for(lambda: len(saved(run)) > 1, process)
-    filler = fill(folder)
+    spoil()
     before = saved(run)[-1]
     printed = []
     for output_line in process.stdout:
@@ -104,7 +128,7 @@ def full(folder: Path) -> None:
     times = psutil.Process(process.pid).cpu_times
     worked = times().user  # the run continues and keeps its metrics in memory
     wait_for(lambda: times().user > worked + 1.0, process)
-    filler.unlink()
+    mend()
     wait_for(lambda: saved(run)[-1] > before, process)
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate()
@@ -118,6 +142,19 @@ def full(folder: Path) -> None:
     assert (np.diff(steps) < 2 * EPISODE).all(), "a row is missing"  # one episode was cut off
     assert steps[0] == EPISODE
     print("".join(printed), out)
+
+
+def shared_memory(folder: Path) -> None:
+    """Worker processes need shared memory: without it, one line, and no folder."""
+    for size, options in (("1m", "remount,ro"), ("4k", "remount,nr_inodes=1")):
+        mount(Path("/dev/shm"), f"size={size}")
+        mount(Path("/dev/shm"), options)
+        process = start(line(folder / "run", "--num-envs", "2", "--no-synchronous"))
+        _, err = process.communicate()
+        assert process.returncode == 2, err
+        assert err.count("\n") == 1
+        assert "/dev/shm" in err
+        assert not (folder / "run").exists()
 
 
 def full_to_the_end(folder: Path) -> None:
@@ -173,5 +210,5 @@ def full_from_the_start(folder: Path) -> int:
 
 
 if __name__ == "__main__":
-    kinds = {"full": full, "full_to_the_end": full_to_the_end, "read_only": read_only}
-    kinds[sys.argv[1]](Path(sys.argv[2]))
+    kinds = (full, full_to_the_end, forbidden, read_only, shared_memory)
+    {kind.__name__: kind for kind in kinds}[sys.argv[1]](Path(sys.argv[2]))

@@ -53,6 +53,18 @@ def together(*actions: Any) -> list[BaseException | None]:
 
 
 @pytest.mark.usefixtures("_quick")
+def test_runs_that_start_at_once_without_a_name_get_folders_of_their_own(tmp_path: Path) -> None:
+    def begin() -> None:
+        with Run.begin(CONFIG, *SPACES, home=tmp_path) as run:
+            begun.append(run.path.name)
+
+    for _ in range(10):
+        begun: list[str] = []
+        assert together(*[begin] * 4) == [None] * 4
+        assert len(set(begun)) == 4
+
+
+@pytest.mark.usefixtures("_quick")
 @pytest.mark.parametrize("fails", [False, True])
 def test_only_one_of_several_processes_starts_a_run(tmp_path: Path, fails: bool) -> None:
     """A start that fails while it holds the lock removes only its own folder."""

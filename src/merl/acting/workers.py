@@ -31,6 +31,7 @@ from merl.acting.run_env import (
 from merl.agents.config import ObservationConfig
 from merl.config import TrainConfig
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
+from merl.core.files import cause
 from merl.core.output import tolerate_lost_output
 from merl.core.python_path import set_value, users_value, working_folder_hidden
 from merl.core.user_code import in_one_line, module_folder
@@ -170,7 +171,10 @@ class WorkerEnvs:
         ):
             # The exception of a worker is raised here; Gymnasium must not print it as well.
             gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
-            return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+            with _shared_memory(self.count):
+                return AsyncVectorEnv(
+                    makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED
+                )
 
 
 def check_sendable(config: TrainConfig, make: MakeEnv | None) -> None:
@@ -187,6 +191,20 @@ def check_sendable(config: TrainConfig, make: MakeEnv | None) -> None:
             f"{config.num_envs} ({in_one_line(error)}): let the function make all that it uses, or "
             "use num-envs 1 and synchronous"
         ) from None
+
+
+@contextmanager
+def _shared_memory(count: int) -> Iterator[None]:
+    """Explain an error of the system while processes with shared memory are started."""
+    try:
+        yield
+    except ConnectionError:  # a process died
+        raise
+    except OSError as error:
+        raise MerlError(
+            f"the worker processes of num-envs {count} cannot be started: {cause(error)}: they "
+            "need shared memory (/dev/shm) and open files; or use num-envs 1 and synchronous"
+        ) from error
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from typing import Any
 
 import merl
 from merl.core import MerlError, suggest
+from merl.core.files import cause
 from merl.core.output import tolerant_output
 from merl.core.python_path import working_folder_hidden
 
@@ -92,6 +93,12 @@ def _run(args: list[str]) -> int:
             traceback.print_exc()
         print(f"merl: error: {error}", file=sys.stderr)
         return error.exit_code
+    except OSError as error:  # of a file that nobody expected to fail
+        if os.environ.get("MERL_TRACEBACK"):
+            traceback.print_exc()
+        place = f"{error.filename}: " if error.filename else ""
+        print(f"merl: error: {place}{cause(error)}", file=sys.stderr)
+        return MerlError.exit_code
     except KeyboardInterrupt as stop:
         return 128 + getattr(stop, "number", signal.SIGINT)
 

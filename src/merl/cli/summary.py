@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -11,6 +13,7 @@ from rich.table import Table
 from merl.acting.run_env import make_run_env
 from merl.config import TrainConfig
 from merl.core import counted
+from merl.core.files import entries
 from merl.core.user_code import reason
 from merl.evaluation.evaluation import Act, Evaluation, evaluate
 from merl.report.references import RANDOM, Reference, references
@@ -44,7 +47,9 @@ def summarize(outcome: Outcome, console: Console) -> None:
         console.print(f"learning curve: {curve}", highlight=False, soft_wrap=True)
     except Exception as error:  # Matplotlib's errors too
         console.print(f"the curve was not drawn: {reason(error)}", highlight=False)
-    videos = sorted(run.videos.glob("*.mp4")) if run.videos.is_dir() else []
+    videos: list[Path] = []
+    with suppress(OSError):
+        videos = [path for path in entries(run.videos) if path.suffix == ".mp4"]
     if videos:
         console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
     if trained is not None:

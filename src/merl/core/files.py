@@ -1,23 +1,38 @@
-"""Files of a run folder, which may come from anyone: kind and size are checked before the content.
+"""Files of a run folder: opened, read, written, replaced and removed here.
 
-Every file of a run is opened here. A FIFO would hang, a device could do anything, and a sparse file
-of a terabyte would fill the memory. A refusal is an `OSError` whose `strerror` says why.
+They may come from anyone, so kind and size are checked before the content: a FIFO would hang, a
+device could do anything, and a sparse file of a terabyte would fill the memory. A refusal is an
+`OSError` whose `strerror` says why, like that of a full, read-only or lost disk. Whoever can go on
+without the file catches it; everyone else turns it into one line with `reporting`.
 """
 
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
+import shutil
 import stat
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
+
+from merl.core.errors import MerlError
 
 MOST_TEXT = 1 << 28
 """Bytes of the largest text file that is read: a hundred times the longest run's metrics."""
 _SEAL = "checksum"
+_NOT_THAT_FILE = {
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EINVAL,
+    errno.EFBIG,
+    errno.ELOOP,
+}
 _KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a pipe",
@@ -25,6 +40,32 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
+
+
+@contextmanager
+def reporting(problem: str) -> Iterator[None]:
+    """Turn an `OSError` inside the block into one line: the problem, and the system's reason.
+
+    Raises:
+        MerlError: in place of the `OSError`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise MerlError(f"{problem}: {cause(error)}") from error
+
+
+def cause(error: OSError) -> str:
+    """Return why a file operation failed, without the name of the file."""
+    return error.strerror or str(error)
+
+
+def is_damage(error: Exception) -> bool:
+    """Return whether an error says that a file is missing or damaged.
+
+    Other errors of the disk may pass: they say nothing about the content.
+    """
+    return not isinstance(error, OSError) or error.errno in _NOT_THAT_FILE
 
 
 def check_kind(path: Path) -> None:
@@ -103,6 +144,77 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
     content = {name: value for name, value in record.items() if name != _SEAL}
     text = json.dumps(content, sort_keys=True)
     return {**content, _SEAL: f"{zlib.crc32(text.encode()):08x}"}
+
+
+def replace_file(path: Path, *content: bytes) -> None:
+    """Write a file under a temporary name, flush it to disk, and give it its name.
+
+    Raises:
+        OSError: that is not possible; an existing file keeps its content.
+    """
+    part = part_of(path)
+    try:
+        with open_file(part, "wb") as file:
+            file.writelines(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        remove(part)
+        raise
+
+
+def part_of(path: Path) -> Path:
+    """Return the temporary name of a file while it is written."""
+    return path.with_name(f".{path.name}.part")
+
+
+def append_whole(file: io.FileIO, data: bytes | bytearray) -> None:
+    """Write `data` at the end of a file in one write; if that fails, remove the written part.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    end = file.seek(0, io.SEEK_END)
+    try:
+        if (file.write(data) or 0) < len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError as error:
+        with suppress(OSError):  # the disk may refuse this, too
+            file.truncate(end)
+        raise error from None
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it, as far as possible."""
+    with suppress(OSError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def entries(folder: Path) -> list[Path]:
+    """Return what a folder holds, sorted by name; nothing if there is no such folder.
+
+    Raises:
+        OSError: it cannot be read; `Path.glob` would find nothing.
+    """
+    try:
+        return sorted(folder.iterdir())
+    except FileNotFoundError:
+        return []
+
+
+def is_gone(path: Path) -> bool:
+    """Return whether a file is missing, as far as the disk can be asked."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        pass
+    return False
 
 
 def sync(path: Path) -> None:

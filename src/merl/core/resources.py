@@ -8,10 +8,11 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import chdir
+from contextlib import chdir, suppress
 from importlib import import_module
 from pathlib import Path
 
+_CANNOT_RESERVE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
 _ZEROS = bytes(1 << 20)
 
 
@@ -104,6 +105,23 @@ def reserve_file(path: Path, size: int) -> None:
         os.close(file)
 
 
+def reserve_holes(file: int) -> None:
+    """Reserve the disk space of a file that has holes, as a copy of a reserved file may have.
+
+    Raises:
+        OSError: the disk is full. File systems that cannot reserve space are left as they are.
+    """
+    found = os.fstat(file)
+    if found.st_blocks * 512 >= found.st_size:
+        return
+    with suppress(AttributeError):  # macOS
+        try:
+            os.posix_fallocate(file, 0, found.st_size)
+        except OSError as error:
+            if error.errno not in _CANNOT_RESERVE:
+                raise
+
+
 def _allocate(file: int, start: int, end: int) -> None:
     """Reserve the bytes from `start` to `end`; write zeros if the system has no better way."""
     try:
@@ -112,7 +130,7 @@ def _allocate(file: int, start: int, end: int) -> None:
     except AttributeError:  # macOS
         pass
     except OSError as error:
-        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS):
+        if error.errno not in _CANNOT_RESERVE:
             raise
     while start < end:
         start += os.pwrite(file, _ZEROS[: end - start], start)

@@ -117,6 +117,12 @@ def to_info(info: Any) -> dict[str, Any]:
                 f'the environment\'s info["reward_terms"] is {shown(terms)}: it must be a dict of '
                 "numbers"
             )
+        for name in terms:
+            if not str(name).isprintable():  # it names a column of the metrics
+                raise EnvironmentFailed(
+                    f"the environment's reward term {shown(name)} has a line break or another "
+                    "character that cannot be printed in its name: rename it"
+                )
         checked["reward_terms"] = {
             str(name): to_number(f"reward term {name!r}", value) for name, value in terms.items()
         }

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 import merl
 from merl.agents.ddpg import DDPG
 from merl.core import MerlError, check_choice
+from merl.core.files import cause, remove
 from merl.evaluation.exported import FORMER, NEXT, Form, Run, Values, card_of, load_exported
 from merl.evaluation.policy import Policy
 from merl.evaluation.to_numpy import numpy_program
@@ -141,9 +142,9 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
         }
         card_of(output).write_text(json.dumps(card, indent=1) + "\n")
     except OSError as error:
-        raise MerlError(f"{output} cannot be written: {error.strerror}") from None
+        raise MerlError(f"{output} cannot be written: {cause(error)}") from error
     finally:
-        part.unlink(missing_ok=True)
+        remove(part)
     return card
 
 

@@ -233,7 +233,9 @@ class Connection:
                 spool.sync()
                 data = spool.read(number, min(_MOST_SENT, last - number + 1))
                 channel.send({}, data)
-            except OSError:
-                channel.close()  # ends `_talk`, which connects again
+            except (OSError, MerlError) as error:
+                if isinstance(error, MerlError):  # of the spool; raised in the acting thread
+                    self._error, self._closed = error, True
+                channel.close()  # ends `_talk`, which else connects again
                 return
             number += len(data) // self._layout.size

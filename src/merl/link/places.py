@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from merl.core import MerlError
+from merl.core.files import read_json, replace_file, reporting
 from merl.link.protocol import Channel
 from merl.runs.run_folder import ACTORS_FILE
 
@@ -34,10 +35,11 @@ def place_of(actor: str, run: Path, count: int) -> int:
     """Return the place of an actor; a new one takes a free place.
 
     Raises:
-        MerlError: all places are taken by others.
+        MerlError: all places are taken by others, or their list cannot be read or written.
     """
     file = run / ACTORS_FILE
-    names: list[Any] = json.loads(file.read_text()) if file.exists() else []
+    with reporting(f"{file} cannot be read"):
+        names: list[Any] = read_json(file) if file.exists() else []
     if actor in names:
         return names.index(actor)
     if None not in names:
@@ -49,7 +51,6 @@ def place_of(actor: str, run: Path, count: int) -> int:
         names.append(None)
     place = names.index(None)
     names[place] = actor
-    part = file.with_name(f".{file.name}.part")
-    part.write_text(json.dumps(names))
-    part.replace(file)
+    with reporting(f"{file} cannot be written"):
+        replace_file(file, json.dumps(names).encode())
     return place

@@ -12,12 +12,12 @@ import os
 import threading
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 
 from merl.core import MerlError, counted
-from merl.core.files import sync
+from merl.core.files import cause, entries, replace_file, reporting, sync
 
 _ABOUT, _LOCK, _SUFFIX = "spool.json", "lock", ".steps"
 
@@ -70,7 +70,7 @@ class Spool:
                     f"another actor uses {folder}: give each actor its own folder with --spool"
                 ) from None
             except OSError as error:
-                raise MerlError(f"spool {folder} cannot be used: {error.strerror}") from None
+                raise MerlError(f"spool {folder} cannot be used: {cause(error)}") from error
             stack.callback(spool.close)
             yield spool
 
@@ -83,14 +83,16 @@ class Spool:
         if self.run == run:
             return
         if self.run is not None:
-            count = sum(file.stat().st_size > 0 for file in self._files())
+            with self._reporting():
+                count = sum(file.stat().st_size > 0 for file in self._files())
             if count and not self._done:
                 raise MerlError(
                     f"{self.folder} holds timesteps of another run: connect to the learner of that "
                     "run, or name another folder with --spool"
                 )
-            for file in self._files():
-                file.unlink()
+            with self._reporting():
+                for file in self._files():
+                    file.unlink()
             self.id = uuid.uuid4().hex
         self.run, self._done = run, False
         self._write_about()
@@ -107,11 +109,12 @@ class Spool:
             MerlError: the folder and the learner do not fit together.
         """
         self._size = size
-        files = self._files()
-        if files:  # the machine may have lost power while it wrote the last one
-            _cut(files[-1], size, number)
+        with self._reporting():
+            files = self._files()
+            if files:  # the machine may have lost power while it wrote the last one
+                _cut(files[-1], size, number)
+            ends = [int(file.stem) + file.stat().st_size // size for file in files]
         self.first = int(files[0].stem) if files else received + 1
-        ends = [int(file.stem) + file.stat().st_size // size for file in files]
         self.last = ends[-1] - 1 if files else received
         if any(end != int(file.stem) for end, file in zip(ends, files[1:], strict=False)):
             raise MerlError(f"{self.folder} lacks timesteps: name another folder with --spool")
@@ -126,7 +129,8 @@ class Spool:
                 f"{self.first - 1:,} are no longer in {self.folder}: name another folder with "
                 f"--spool; those and the {counted(len(self), 'timestep')} in it are then not used"
             )
-        self._new_file()
+        with self._reporting():
+            self._new_file()
 
     def __len__(self) -> int:
         """Return the number of timesteps."""
@@ -143,32 +147,44 @@ class Spool:
                 if os.write(self._file, data) != len(data):
                     raise OSError(0, "the disk is full")
             except OSError as error:
-                os.ftruncate(self._file, (self.last + 1 - self._begin) * self._size)
-                raise MerlError(
-                    f"spool {self.folder} cannot be written: {error.strerror}"
-                ) from None
+                with suppress(OSError):  # `start` removes an incomplete timestep, too
+                    os.ftruncate(self._file, (self.last + 1 - self._begin) * self._size)
+                raise MerlError(f"spool {self.folder} cannot be written: {cause(error)}") from error
             self.last += 1
 
     def sync(self) -> None:
-        """Wait until all timesteps are on the disk, so that a loss of power cannot remove them."""
-        with self._lock:
-            file = os.dup(self._file)
-        try:
-            os.fsync(file)
-        finally:
-            os.close(file)
+        """Wait until all timesteps are on the disk, so that a loss of power cannot remove them.
+
+        Raises:
+            MerlError: the disk failed.
+        """
+        with self._reporting():
+            with self._lock:
+                file = os.dup(self._file)
+            try:
+                os.fsync(file)
+            finally:
+                os.close(file)
 
     def read(self, number: int, most: int) -> bytes:
-        """Return timestep `number` and the next ones in the same file, at most `most`."""
-        with self._lock:
+        """Return timestep `number` and the next ones in the same file, at most `most`.
+
+        Raises:
+            MerlError: they cannot be read.
+        """
+        with self._reporting(), self._lock:
             begin = max(int(file.stem) for file in self._files() if int(file.stem) <= number)
             with self._path(begin).open("rb") as file:
                 file.seek((number - begin) * self._size)
                 return file.read(most * self._size)
 
     def discard(self, saved: int) -> None:
-        """Remove the files with timesteps up to number `saved` alone; begin a new file."""
-        with self._lock:
+        """Remove the files with timesteps up to number `saved` alone; begin a new file.
+
+        Raises:
+            MerlError: the disk failed.
+        """
+        with self._reporting(), self._lock:
             if self.last >= self._begin:
                 os.fsync(self._file)
                 self._new_file()
@@ -196,20 +212,20 @@ class Spool:
         self._file = os.open(self._path(self._begin), flags, 0o644)
         sync(self.folder)
 
+    def _reporting(self) -> AbstractContextManager[None]:
+        return reporting(f"spool {self.folder} cannot be used")
+
     def _path(self, begin: int) -> Path:
         return self.folder / f"{begin:016d}{_SUFFIX}"
 
     def _files(self) -> list[Path]:
-        return sorted(self.folder.glob(f"*{_SUFFIX}"))
+        return [file for file in entries(self.folder) if file.suffix == _SUFFIX]
 
     def _write_about(self) -> None:
-        part = self.folder / f".{_ABOUT}.part"
-        with part.open("w") as file:
-            json.dump({"id": self.id, "run": self.run, "done": self._done}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(self.folder / _ABOUT)
-        sync(self.folder)
+        about = {"id": self.id, "run": self.run, "done": self._done}
+        with self._reporting():
+            replace_file(self.folder / _ABOUT, json.dumps(about).encode())
+            sync(self.folder)
 
 
 def _cut(file: Path, size: int, number: Callable[[bytes], int | None]) -> None:

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from merl.core import MerlError
+from merl.core.files import remove
+from merl.core.resources import reserve_file
+from merl.core.user_code import in_one_line
 
 _COMPILER_FLAGS = "-menable-no-nans -fno-signed-zeros -Wno-nan-infinity-disabled"
 """Flags that cut the time to a quarter with identical images: the kernels never produce NaN."""
+_ROOM = 8 << 20
+"""Bytes that must be free for compiled kernels: if the disk is full, LLVM ends the process."""
+_MODULES = "merl.rendering.raster."
+Loaded = TypeVar("Loaded")
 _warp_lock = threading.RLock()
 
 
@@ -56,6 +66,49 @@ def compiling(seconds: float = 2.0) -> Iterator[threading.Thread]:
         yield watching
 
 
+def load_kernels(load: Callable[[], Loaded]) -> Loaded:
+    """Return `load()`, which compiles kernels or loads them from the cache, in `compiling`.
+
+    If it fails, the files in the cache may be damaged, or its disk may be full. It is then called
+    again after merl's kernels were removed from the cache, and at last with a temporary folder.
+
+    Raises:
+        MerlError: it fails even then.
+    """
+    for prepare in (None, _empty_cache, _leave_cache):
+        try:
+            if prepare is not None:
+                prepare()
+            return load()
+        except Exception as error:  # Warp has no class of its own for its errors
+            failure = error
+    raise MerlError(
+        f"the renderer's kernels cannot be compiled: {in_one_line(failure)}: free space in the "
+        "folder of temporary files (TMPDIR), or use --renderer gl"
+    ) from failure
+
+
+def _empty_cache() -> None:
+    """Remove merl's kernels from the cache."""
+    import warp
+
+    for folder in Path(str(warp.config.kernel_cache_dir)).glob(f"wp_{_MODULES}*"):
+        remove(folder)
+    for name in [name for name in sys.modules if name.startswith(_MODULES)]:
+        module: Any = warp.get_module(name)
+        module.mark_modified()  # else Warp only repeats the failure
+
+
+def _leave_cache() -> None:
+    """Use a folder that ends with this process."""
+    import warp
+
+    folder = tempfile.mkdtemp(prefix="merl-warp-")
+    atexit.register(remove, Path(folder))
+    warp.config.kernel_cache_dir = folder
+    _empty_cache()
+
+
 @contextmanager
 def _notice_if_slow(seconds: float) -> Iterator[threading.Thread]:
     begin, is_over = time.process_time(), threading.Event()
@@ -75,7 +128,7 @@ def _notice_if_slow(seconds: float) -> Iterator[threading.Thread]:
 
 
 def _kernel_cache() -> Path:
-    """Return a writable folder of this user: in the user's cache, else among temporary files."""
+    """Return a folder of this user with room: in the user's cache, else among temporary files."""
     candidates = [Path(tempfile.gettempdir()) / f"merl-warp-{os.getuid()}"]
     with suppress(RuntimeError):  # the user may have no home
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -85,9 +138,13 @@ def _kernel_cache() -> Path:
     for folder in candidates:
         with suppress(OSError):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                if folder.stat().st_uid == os.getuid():  # only run this user's code
-                    return folder
+            probe = folder / f".part-{os.getpid()}"
+            try:
+                reserve_file(probe, _ROOM)
+            finally:
+                remove(probe)
+            if folder.stat().st_uid == os.getuid():  # only run this user's code
+                return folder
     return Path(tempfile.mkdtemp(prefix="merl-warp-"))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.core.files import open_file, read_file
+from merl.core.files import cause, is_gone, open_file, read_file, replace_file, reporting
 from merl.replay.spec import Field
 
 STAGES = (1, 5, 25)
@@ -92,8 +92,18 @@ class Backgrounds:
         """Keep the backgrounds of the first `frames` frames, and discard all newer ones."""
         self._first = self._first[:frames]
         self._made = self._medians()
-        if self._file is not None and self._file.exists():
-            os.truncate(self._file, frames * self._field.bytes)
+        if self._file is not None and not is_gone(self._file):
+            with reporting(f"{self._file} cannot be written"):
+                os.truncate(self._file, frames * self._field.bytes)
+
+    def write_again(self) -> None:
+        """Write the file of the first frames, which was removed.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        assert self._file is not None
+        replace_file(self._file, *(frame.tobytes() for frame in self._first))
 
     def _medians(self) -> list[NDArray[Any]]:
         black = np.zeros(self._field.shape, self._field.dtype).reshape(-1)
@@ -115,7 +125,7 @@ def _content(path: Path, field: Field) -> bytes:
     except FileNotFoundError:
         return b""
     except OSError as error:
-        raise MerlError(f"{path} cannot be read: {error.strerror}") from None
+        raise MerlError(f"{path} cannot be read: {cause(error)}") from error
 
 
 def _append(path: Path, frame: NDArray[Any], at: int) -> None:

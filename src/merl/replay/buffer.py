@@ -9,6 +9,7 @@ restores them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,9 @@ from merl.replay.ring import EpisodeRing
 from merl.replay.sampling import SampleIndices, Sampler
 from merl.replay.spec import ReplaySpec, field_name, span_name
 from merl.replay.stack_reader import RawFrames, ReadAhead, copy_stacks, copy_unchanged
-from merl.replay.storage import Storage, in_memory, new_files, open_files
+from merl.replay.storage import Storage, in_memory, is_lost, new_files, open_files
+
+_LOG = logging.getLogger(__name__)
 
 
 class ReplayBuffer:
@@ -153,7 +156,17 @@ class ReplayBuffer:
         return batch
 
     def flush(self) -> None:
-        """Write all data to the disk, and return when it is there."""
+        """Write all data to the disk, and return when it is there.
+
+        If a file was removed, all are written again, with a warning.
+
+        Raises:
+            MerlError: they cannot be written again.
+            OSError: the disk failed.
+        """
+        if self._directory is not None and is_lost(self._directory, self._storage):
+            _LOG.warning("the replay in %s was removed: it is written again", self._directory)
+            self._copy_to_new_files(self._directory)
         self._storage.flush()
 
     def confirm_checkpoint(self) -> None:
@@ -226,12 +239,14 @@ class ReplayBuffer:
             for key, frames in state["starts"].items():
                 self._compressed[key].backgrounds.truncate(int(frames))
         if self._directory is not None and self.slots < self.spec.slots:
-            self._grow(self._directory)
+            self._copy_to_new_files(self._directory)
 
-    def _grow(self, directory: Path) -> None:
-        """Replace the files by larger ones with the same timesteps."""
-        rings = self.rings
+    def _copy_to_new_files(self, directory: Path) -> None:
+        """Replace the files by new ones, of the size for the capacity, with the same timesteps."""
+        rings, compressed = self.rings, self._compressed
         with new_files(directory, self.spec) as storage:
+            for frames in compressed.values():
+                frames.backgrounds.write_again()
             self._use(storage)
             for ring, shorter in zip(self.rings, rings, strict=True):
                 ring.copy_from(shorter)

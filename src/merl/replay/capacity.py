@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from merl.core import MerlError, counted
+from merl.core.files import reporting
 from merl.core.resources import available_memory, existing_parent, free_disk
 from merl.replay.spec import ReplaySpec
 
@@ -20,12 +21,15 @@ def check_fits(spec: ReplaySpec, directory: Path | None = None) -> None:
         directory: folder of the replay, new or existing; None: in memory.
 
     Raises:
-        MerlError: it does not fit; the message names the largest capacity that fits.
+        MerlError: it does not fit, and the message names the largest capacity that fits; or the
+            disk cannot be asked.
     """
     room = {"of memory are available": available_memory()}
-    if directory is not None and _bytes_in(directory) < spec.bytes:  # needs new files
-        where = existing_parent(directory)
-        room[f"of disk space are free in {where}"] = free_disk(where)
+    if directory is not None:
+        with reporting(f"{directory} cannot be used"):
+            if _bytes_in(directory) < spec.bytes:  # needs new files
+                where = existing_parent(directory)
+                room[f"of disk space are free in {where}"] = free_disk(where)
     what, least = min(room.items(), key=lambda item: item[1])
     if spec.bytes > least:
         raise MerlError(

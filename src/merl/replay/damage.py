@@ -80,11 +80,14 @@ def find_damage(directory: Path, spec: ReplaySpec, state: Mapping[str, Any]) -> 
 def last_lost(data: RingData, covered: Covered) -> int:
     """Return the last timestep of a checkpoint that newer ones have overwritten; 0 if none is.
 
-    Timesteps are overwritten in their order: first they are marked with 0.
+    Timesteps are overwritten in their order: first they are marked with 0. An incomplete journal
+    has restored some of the oldest.
     """
     timesteps = np.arange(covered["oldest"], covered["newest"] + 1)
     stamps = data.arrays["timestep"][data.rows(timesteps)]
     kept = (stamps != 0) & ((stamps <= timesteps) | ((stamps - timesteps) % data.slots != 0))
+    overwritten = ~kept & (stamps != 0)
+    kept &= timesteps > timesteps[overwritten].max(initial=0)
     first = int(kept.argmax()) if kept.any() else len(kept)
     return int(timesteps[first - 1]) if first else 0
 

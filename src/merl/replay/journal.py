@@ -8,19 +8,21 @@ file and keeps the former one, from which the checkpoint before it can be restor
 
 from __future__ import annotations
 
+import io
 import logging
 import mmap
 import os
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.core.files import open_file
+from merl.core.files import append_whole, cause, open_file, remove, reporting
 
 _HEAD = struct.Struct("<5q")  # ring, timestep, index of the array, first byte, number of bytes
 _FORMER = ".former"
@@ -43,11 +45,8 @@ class Journal:
         self._index = {name: index for index, name in enumerate(arrays)}
         self._arrays = as_bytes(arrays)
         self._is_complete = True
-        try:
-            # Unbuffered: written data survives if the process is killed.
-            self._file = open_file(path, "a+b", buffering=0)
-        except OSError as error:
-            raise MerlError(f"cannot store a replay in {path.parent}: {error.strerror}") from None
+        with reporting(f"cannot store a replay in {path.parent}"):
+            self._file = _opened(path)
 
     def keep(self, ring: int, timestep: int, ranges: Iterable[tuple[str, int, int]]) -> None:
         """Record bytes before a timestep overwrites them.
@@ -68,19 +67,21 @@ class Journal:
             index = self._index[name]
             record += _HEAD.pack(ring, timestep, index, begin, count)
             record += self._arrays[index][begin : begin + count].data
-        reason = "the disk is full"
         try:
-            whole = self._file.write(record) == len(record)
+            append_whole(self._file, record)
         except OSError as error:
-            whole, reason = False, error.strerror or str(error)
-        if not whole:
+            self._stop(error)
+
+    def _stop(self, error: OSError) -> None:
+        """Record nothing until the next checkpoint."""
+        self._is_complete = False
+        with suppress(OSError):  # it takes space, and is of no use without the rest
             self._file.truncate(0)
-            self._is_complete = False
-            _LOG.warning(
-                "cannot write the replay's journal: %s; until the next checkpoint, resuming loses "
-                "the oldest steps of the replay",
-                reason,
-            )
+        _LOG.warning(
+            "cannot write the replay's journal: %s; until the next checkpoint, resuming loses "
+            "the oldest steps of the replay",
+            cause(error),
+        )
 
     def undo(self, timesteps: Sequence[int]) -> None:
         """Restore the bytes that later timesteps than `timesteps`, one per ring, overwrote.
@@ -88,27 +89,34 @@ class Journal:
         The records of these bytes are removed.
 
         Raises:
-            MerlError: the journal cannot be read.
+            MerlError: the journal cannot be read or shortened.
         """
         for file, end in undo_into(self._arrays, self._path, timesteps).items():
-            os.truncate(file, end)
+            with reporting(f"{file} cannot be written"):
+                os.truncate(file, end)
         self._is_complete = True
 
     def begin_anew(self) -> None:
         """Begin new records after a checkpoint, and keep those since the checkpoint before it."""
-        self._is_complete = True
         try:
-            self._path.replace(self._path.with_suffix(_FORMER))
-            file = open_file(self._path, "a+b", buffering=0)
-        except OSError:  # the folder cannot be written any more
-            self._file.truncate(0)
+            with suppress(FileNotFoundError):  # only the opening failed, after the last checkpoint
+                self._path.replace(self._path.with_suffix(_FORMER))
+            file = _opened(self._path)
+        except OSError as error:  # then the records continue in the same file, if all are there
+            if not self._is_complete:
+                self._stop(error)
         else:
             self._file.close()
-            self._file = file
+            self._file, self._is_complete = file, True
 
     def forget_former(self) -> None:
         """Remove the records for the checkpoint before the last: the arrays have moved."""
-        self._path.with_suffix(_FORMER).unlink(missing_ok=True)
+        remove(self._path.with_suffix(_FORMER))
+
+
+def _opened(path: Path) -> io.FileIO:
+    """Open the file of a journal, unbuffered: written data survives if the process is killed."""
+    return cast(io.FileIO, open_file(path, "a+b", buffering=0))
 
 
 class _Record(NamedTuple):
@@ -150,7 +158,7 @@ def undo_into(
         except FileNotFoundError:
             continue
         except OSError as error:
-            raise MerlError(f"{file} cannot be read: {error.strerror}") from None
+            raise MerlError(f"{file} cannot be read: {cause(error)}") from error
         later = [each for each in records if each.timestep > timesteps[each.ring]]
         ends[file] = max((each.end for each in records[: len(records) - len(later)]), default=0)
         for each in reversed(later):

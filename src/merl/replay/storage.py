@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import json
 import mmap
-import os
-import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.core.files import check_kind, open_file, read_json
-from merl.core.resources import reserve_file
+from merl.core.files import (
+    cause,
+    check_kind,
+    entries,
+    is_damage,
+    is_gone,
+    open_file,
+    read_json,
+    remove,
+    replace_file,
+    reporting,
+)
+from merl.core.resources import reserve_file, reserve_holes
 from merl.replay.spec import ReplaySpec
 
 _HEADER, _PART = "replay.json", "part"
@@ -62,28 +71,32 @@ def open_files(directory: Path, spec: ReplaySpec) -> Storage:
     """Open the files of an existing replay with its own number of slots, or create them.
 
     Raises:
-        MerlError: see `new_files`; or the directory holds another replay or a damaged one.
+        MerlError: see `new_files`; or the directory holds another replay or a damaged one, or
+            cannot be read.
     """
-    folder = folder_in(directory)
+    with _reporting(directory):
+        folder = folder_in(directory)
     if folder is None:
         with new_files(directory, spec) as storage:
             return storage
-    _check(folder, spec)
-    _remove_others(folder)
-    return _mapped(folder, spec, int(folder.name))
+    with _reporting(directory):
+        _check(folder, spec)
+        _remove_others(folder)
+        return _mapped(folder, spec, int(folder.name))
 
 
 def open_copy(directory: Path, spec: ReplaySpec) -> Storage:
     """Open the files of an existing replay; changes stay in memory and leave the files unchanged.
 
     Raises:
-        MerlError: there is no replay, or another one, or a damaged one.
+        MerlError: there is no replay, or another one, or a damaged one, or it cannot be read.
     """
-    folder = folder_in(directory)
-    if folder is None:
-        raise MerlError(f"{directory} holds no replay")
-    _check(folder, spec)
-    return _mapped(folder, spec, int(folder.name), mmap.ACCESS_COPY)
+    with _reporting(directory):
+        folder = folder_in(directory)
+        if folder is None:
+            raise MerlError(f"{directory} holds no replay")
+        _check(folder, spec)
+        return _mapped(folder, spec, int(folder.name), mmap.ACCESS_COPY)
 
 
 def holds_steps(directory: Path) -> bool:
@@ -103,8 +116,12 @@ def holds_steps(directory: Path) -> bool:
 
 
 def folder_in(directory: Path) -> Path | None:
-    """Return the folder of an existing replay, the largest; None if there is none."""
-    folders = [path for path in directory.glob("*") if path.name.isdecimal()]
+    """Return the folder of an existing replay, the largest; None if there is none.
+
+    Raises:
+        OSError: the directory cannot be read.
+    """
+    folders = [path for path in entries(directory) if path.name.isdecimal()]
     return max(folders, key=lambda path: int(path.name), default=None)
 
 
@@ -117,28 +134,23 @@ def new_files(directory: Path, spec: ReplaySpec) -> Iterator[Storage]:
             error the new files are removed, and existing files keep their contents.
     """
     part = directory / _PART
-    new_parents = [path for path in part.parents if not path.exists()]
+    new_parents = [path for path in part.parents if is_gone(path)]
     try:
-        shutil.rmtree(part, ignore_errors=True)  # left by a process that died
-        part.mkdir(parents=True)
-        for name, field in spec.fields.items():
-            reserve_file(part / f"{name}.bin", spec.rings * spec.slots * field.bytes)
-        storage = _mapped(part, spec, spec.slots)
-        yield storage
-        storage.flush()
-        with (part / _HEADER).open("w") as file:
-            json.dump(_described(spec), file, indent=2)
-            file.flush()
-            os.fsync(file.fileno())
-        part.rename(directory / str(spec.slots))
-    except BaseException as error:
-        shutil.rmtree(part, ignore_errors=True)
+        with reporting(f"cannot store a replay in {directory}"):
+            remove(part)  # left by a process that died
+            part.mkdir(parents=True)
+            for name, field in spec.fields.items():
+                reserve_file(part / f"{name}.bin", spec.rings * spec.slots * field.bytes)
+            storage = _mapped(part, spec, spec.slots)
+            yield storage
+            storage.flush()
+            replace_file(part / _HEADER, json.dumps(_described(spec), indent=2).encode())
+            part.rename(directory / str(spec.slots))
+    except BaseException:
+        remove(part)
         for parent in new_parents:
             with suppress(OSError):
                 parent.rmdir()
-        if isinstance(error, OSError):
-            why = error.strerror or error
-            raise MerlError(f"cannot store a replay in {directory}: {why}") from error
         raise
     _remove_others(directory / str(spec.slots))
 
@@ -149,24 +161,43 @@ def _mapped(folder: Path, spec: ReplaySpec, slots: int, access: int = mmap.ACCES
     for name, field in spec.fields.items():
         size = spec.rings * slots * field.bytes
         with open_file(folder / f"{name}.bin", mode) as file:
+            if access == mmap.ACCESS_WRITE:
+                reserve_holes(file.fileno())
             files[name] = mmap.mmap(file.fileno(), size, access=access)
         arrays[name] = np.frombuffer(files[name], field.dtype).reshape(-1, *field.shape)
     return Storage(slots, arrays, files)
 
 
+def is_lost(directory: Path, storage: Storage) -> bool:
+    """Return whether a file of a replay was removed, so that only its memory map exists."""
+    folder = directory / str(storage.slots)
+    return any(is_gone(folder / name) for name in (_HEADER, *(f"{n}.bin" for n in storage.files)))
+
+
 def _remove_others(folder: Path) -> None:
     """Remove files that this folder replaces, and incomplete files of a process that died."""
-    for other in folder.parent.iterdir():
-        if other != folder and (other.name == _PART or other.name.isdecimal()):
-            shutil.rmtree(other, ignore_errors=True)
+    with suppress(OSError):  # they only take space
+        for other in entries(folder.parent):
+            if other != folder and (other.name == _PART or other.name.isdecimal()):
+                remove(other)
+
+
+def _reporting(directory: Path) -> AbstractContextManager[None]:
+    return reporting(f"the replay in {directory} cannot be opened")
 
 
 def _check(folder: Path, spec: ReplaySpec) -> None:
-    """Raise MerlError if the replay in the folder has other fields or is damaged."""
+    """Raise MerlError if the replay in the folder has other fields or is damaged.
+
+    Raises:
+        OSError: the disk does not let it be read.
+    """
     directory, rows = folder.parent, spec.rings * int(folder.name)
     try:
         same = read_json(folder / _HEADER) == _described(spec)
     except (OSError, ValueError) as error:
+        if not is_damage(error):
+            raise
         raise MerlError(
             f"{directory} holds a damaged replay ({_HEADER}: {_reason(error)}): use another folder"
         ) from error
@@ -181,6 +212,8 @@ def _check(folder: Path, spec: ReplaySpec) -> None:
             check_kind(file)
             size = file.stat().st_size
         except OSError as error:
+            if not is_damage(error):
+                raise
             raise MerlError(
                 f"{directory} holds a damaged replay ({file}: {_reason(error)}): use another folder"
             ) from error
@@ -189,7 +222,7 @@ def _check(folder: Path, spec: ReplaySpec) -> None:
 
 
 def _reason(error: Exception) -> str:
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+    return cause(error) if isinstance(error, OSError) else str(error)
 
 
 def _described(spec: ReplaySpec) -> dict[str, Any]:

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from merl.core import LOCK_FILE, METRICS_FILE, MerlError, counted
-from merl.core.files import open_file
+from merl.core.files import cause, open_file, reporting
 from merl.replay import ReplaySpec
 from merl.replay.damage import find_damage
-from merl.runs.checkpoint import Checkpoint, folders, readable
+from merl.runs.checkpoint import Checkpoint, readable
+from merl.runs.checkpoint_folders import folders
 from merl.runs.metrics import read_rows
 from merl.runs.run import Run
 
@@ -33,7 +34,9 @@ def check_run(run: Run) -> Iterator[Finding]:
     with _not_in_use(run.path):
         yield Finding(True, f"{run.path}/config.json is sound")
         last = None
-        for path in folders(run.checkpoints):
+        with reporting(f"checkpoints {run.checkpoints} cannot be read"):
+            found = folders(run.checkpoints).values()
+        for path in found:
             try:
                 last = Checkpoint.open(path)
                 yield Finding(True, f"{path} is sound")
@@ -84,5 +87,5 @@ def _not_in_use(run: Path) -> Iterator[None]:
         except BlockingIOError:
             raise MerlError(f"a process is training in {run}: stop it first") from None
         except OSError as error:
-            raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
+            raise MerlError(f"{path} cannot be locked: {cause(error)}") from error
         yield

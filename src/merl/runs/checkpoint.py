@@ -3,7 +3,8 @@
 `checkpoints/00010000/` holds `weights.safetensors` (the dicts of tensors in the agent's state),
 `learner.pt` (the rest of it, e.g. optimizers and random generators; read with `weights_only=True`),
 `state.json` (progress of the run) and `manifest.json` (sizes and SHA-256 of the other files). The
-folder is written under a temporary name, flushed to disk, then renamed.
+folder is written under a temporary name, flushed to disk, then renamed. A checkpoint that it
+replaces is called `.former-00010000` until then.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import hashlib
 import io
 import json
 import logging
-import shutil
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -26,17 +26,32 @@ from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
 
 from merl.core import Agent, MerlError
-from merl.core.files import open_file, read_json, sealed, sync
+from merl.core.files import (
+    cause,
+    is_damage,
+    is_gone,
+    open_file,
+    read_json,
+    remove,
+    reporting,
+    sealed,
+    sync,
+)
 from merl.core.guards import check_weights
 from merl.networks.settings import torch_settings
+from merl.runs.checkpoint_folders import FORMER, MANIFEST, folders, prune
 
 FORMAT = 1
 _WEIGHTS, _LEARNER = "weights.safetensors", "learner.pt"
-_STATE, _MANIFEST = "state.json", "manifest.json"
+_STATE = "state.json"
 _FILES = (_WEIGHTS, _LEARNER, _STATE)
 _BAD_VALUES = (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError)
 _CPU = torch.device("cpu")
 _LOG = logging.getLogger(__name__)
+
+
+class Unreadable(MerlError):  # noqa: N818 (named after a state)
+    """A checkpoint cannot be read now, so that nobody knows whether it is damaged."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +73,22 @@ class Checkpoint:
         """Read the manifest and check every file against it.
 
         Raises:
-            MerlError: the manifest cannot be read or has another format, or a file is missing,
+            MerlError: the manifest is damaged or has another format, or a file is missing,
                 truncated or changed.
+            Unreadable: the disk does not let a file be read.
         """
         try:
-            manifest = read_json(path / _MANIFEST)
+            return cls._open(path)
+        except OSError as error:
+            raise Unreadable(
+                f"checkpoint {path} cannot be read: {cause(error)}: try again, or move it away to "
+                "use the one before it"
+            ) from error
+
+    @classmethod
+    def _open(cls, path: Path) -> Checkpoint:
+        try:
+            manifest = read_json(path / MANIFEST)
             files, number = manifest["files"], manifest["format"]
             step, score = int(manifest["step"]), manifest["score"]
             score = None if score is None else float(score)
@@ -72,6 +98,8 @@ class Checkpoint:
             if missing:
                 raise ValueError(f"it does not list {', '.join(sorted(missing))}")
         except (OSError, LookupError, *_BAD_VALUES) as error:
+            if not is_damage(error):
+                raise
             raise MerlError(f"checkpoint {path} has no readable manifest ({error})") from None
         if number != FORMAT:
             raise MerlError(
@@ -81,7 +109,9 @@ class Checkpoint:
         for name, expected in files.items():
             try:
                 whole = _fingerprint(path / name, expected["bytes"]) == expected
-            except (OSError, LookupError, TypeError):
+            except (OSError, LookupError, TypeError) as error:
+                if not is_damage(error):
+                    raise
                 whole = False
             if not whole:
                 raise MerlError(f"checkpoint {path}: {name} is missing or damaged")
@@ -98,18 +128,23 @@ class Checkpoint:
             which: "latest", "best" (by score), or a number of steps.
 
         Raises:
-            MerlError: there is no such checkpoint, or the selected one is damaged.
+            MerlError: there is no such checkpoint, the selected one is damaged, or the disk does
+                not let them be read.
         """
+        with reporting(f"checkpoints {root} cannot be read"):
+            found = folders(root)
         if which not in ("latest", "best"):
-            named = {str(int(path.name)): path for path in folders(root)}
+            named = {str(step): path for step, path in found.items()}
             if which not in named:
                 choices = ", ".join(["latest", "best", *named])
                 raise MerlError(f"checkpoint {which!r} does not exist: choose from {choices}")
             return cls.open(named[which])
         whole = []
-        for path in reversed(folders(root)):
+        for path in reversed(found.values()):
             try:
                 whole.append(cls.open(path))
+            except Unreadable:
+                raise
             except MerlError as error:
                 _LOG.warning("%s: checkpoint skipped", error)
                 continue
@@ -161,8 +196,9 @@ def save(
         weights = {group: value for group, value in learnt.items() if _is_weights(group, value)}
         check_weights(weights)
     root.mkdir(exist_ok=True)  # no parents: do not recreate a run folder that was deleted
-    part = root / f".part-{step:08d}"
-    shutil.rmtree(part, ignore_errors=True)
+    part, final = root / f".part-{step:08d}", root / f"{step:08d}"
+    former = root / f"{FORMER}{step:08d}"
+    remove(part)
     part.mkdir()
     try:
         with torch_settings(_CPU):
@@ -173,24 +209,21 @@ def save(
             "score": score,
             "files": {name: _fingerprint(part / name) for name in _FILES},
         }
-        (part / _MANIFEST).write_text(json.dumps(sealed(manifest), indent=1))
+        (part / MANIFEST).write_text(json.dumps(sealed(manifest), indent=1))
         for path in (*part.iterdir(), part):
             sync(path)
-        final = root / f"{step:08d}"
-        former = root / f".part-{step:08d}-former"
-        if final.exists():  # keep the old one until the new one replaces it
+        if not is_gone(final):  # keep the old one until the new one replaces it
+            remove(former)
             final.rename(former)
-        try:
-            part.rename(final)
-        except OSError:
-            if former.exists():
-                former.rename(final)
-            raise
+        part.rename(final)
         sync(root)
     except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
+        remove(part)
+        with suppress(OSError):  # it has not been renamed, or it has been replaced
+            former.rename(final)
         raise
-    _prune(root, step, keep)
+    with suppress(OSError):  # the next checkpoint deletes them
+        prune(root, step, keep)
     return Checkpoint(final, step, score)
 
 
@@ -292,53 +325,6 @@ def _write(
     (folder / _WEIGHTS).write_bytes(to_bytes(flat))
     (folder / _LEARNER).write_bytes(learner.getbuffer())
     (folder / _STATE).write_text(json.dumps(state))
-
-
-def folders(root: Path) -> list[Path]:
-    """Return the folders of checkpoints in the order of their steps."""
-    found = [path for path in root.glob("*") if path.is_dir() and _is_number(path.name)]
-    return sorted(found, key=lambda path: int(path.name))
-
-
-def _is_number(name: str) -> bool:
-    return name.isascii() and name.isdecimal()
-
-
-def _prune(root: Path, step: int, keep: int) -> None:
-    """Delete all checkpoints except the last `keep` and the best, and those after `step`."""
-    discard_later(root, step)
-    every = folders(root)
-    scores = {path: score for path, score in _scores(every) if score is not None}
-    best = max(scores, key=lambda path: scores[path]) if scores else None
-    stale = [path for path in root.glob(".part-*") if path.is_dir()]
-    for path in [*stale, *(path for path in every[:-keep] if path != best)]:
-        _discard(path)
-
-
-def discard_later(root: Path, step: int) -> None:
-    """Delete the checkpoints of later steps than `step`, from which the run was not resumed.
-
-    They were skipped as damaged, and must not count among those that are kept.
-    """
-    for path in folders(root):
-        if int(path.name) > step:
-            _discard(path)
-
-
-def _discard(path: Path) -> None:
-    """Delete a checkpoint; a process that dies here leaves no half of one."""
-    if not path.name.startswith(".part-"):
-        with suppress(OSError):
-            path = path.rename(path.with_name(f".part-{path.name}-pruned"))
-    shutil.rmtree(path, ignore_errors=True)
-
-
-def _scores(paths: list[Path]) -> Iterator[tuple[Path, float | None]]:
-    for path in paths:
-        try:
-            yield path, read_json(path / _MANIFEST)["score"]
-        except (OSError, ValueError, LookupError, TypeError):
-            yield path, None
 
 
 def _fingerprint(path: Path, most: int | None = None) -> dict[str, Any]:

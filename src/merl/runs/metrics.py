@@ -8,16 +8,15 @@ never ends a run: the rows are kept in memory and written as soon as that is pos
 from __future__ import annotations
 
 import csv
-import errno
 import io
 import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from merl.core import METRICS_FILE, MerlError
-from merl.core.files import open_file, read_file
+from merl.core.files import append_whole, cause, read_file, replace_file
 
 _LOG = logging.getLogger(__name__)
 
@@ -130,7 +129,7 @@ class MetricsFile(AbstractContextManager["MetricsFile"]):
             if warn is not None:
                 warn(
                     f"metrics cannot be written to {self._path.parent} "
-                    f"({error.strerror or error}); training continues, and they are kept in memory "
+                    f"({cause(error)}); training continues, and they are kept in memory "
                     "until they can be written"
                 )
 
@@ -145,21 +144,11 @@ class MetricsFile(AbstractContextManager["MetricsFile"]):
         self._written = len(self._rows)
 
     def _rewrite(self) -> None:
-        """Write all rows to a temporary file, replace `metrics.csv` by it, and open it."""
-        temporary = self._path.with_name(f".{self._path.name}.part")
-        try:
-            with open_file(temporary, "wb") as file:
-                file.write(_csv_line(self._columns))
-                file.writelines(map(self._line, self._rows))
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(self._path)
-        except OSError:
-            with suppress(OSError):  # the disk may also refuse to delete
-                temporary.unlink(missing_ok=True)
-            raise
+        """Replace `metrics.csv` by a file with all rows, and open it."""
         if self._file is not None:
             self._file.close()
+            self._file = None
+        replace_file(self._path, _csv_line(self._columns), *map(self._line, self._rows))
         self._file = io.FileIO(self._path, "r+")
         self._written = len(self._rows)
 
@@ -177,7 +166,7 @@ def read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     except FileNotFoundError:
         return ["step"], []
     except OSError as error:
-        raise MerlError(f"{path} cannot be read: {error.strerror}") from None
+        raise MerlError(f"{path} cannot be read: {cause(error)}") from error
     whole = text[: text.rfind(b"\n") + 1]
     if not whole:
         return ["step"], []
@@ -201,14 +190,3 @@ def _csv_line(cells: Iterable[str]) -> bytes:
     line = io.StringIO()
     csv.writer(line, lineterminator="\n").writerow(cells)
     return line.getvalue().encode()
-
-
-def append_whole(file: io.FileIO, data: bytes) -> None:
-    """Write `data` at the end of a file in one write; if that fails, remove the written part."""
-    end = file.seek(0, io.SEEK_END)
-    try:
-        if (file.write(data) or 0) < len(data):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    except OSError:
-        file.truncate(end)
-        raise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,12 +17,12 @@ from merl.agents import AGENTS
 from merl.agents.config import ObservationConfig, UnloadedConfig
 from merl.config import TrainConfig
 from merl.core import CONFIG_FILE, MerlError, check_choice
-from merl.core.files import open_file, read_json, sealed
+from merl.core.files import cause, read_json, replace_file, reporting, sealed
 from merl.core.user_code import module_folder
 from merl.runs import trust
 from merl.runs.plain import box, describe, from_plain, to_plain, told
 from merl.runs.provenance import commit, machine, package_versions
-from merl.runs.run_folder import PART, holds_nothing, program
+from merl.runs.run_folder import holds_nothing, program
 
 FORMAT = 2
 Bounds = tuple[list[float], list[float]]
@@ -65,13 +64,16 @@ def read(folder: Path) -> dict[str, Any]:
     """Return the record of a run.
 
     Raises:
-        MerlError: its format is not that of this version.
+        MerlError: it cannot be read, or its format is not that of this version.
     """
-    record: dict[str, Any] = read_json(folder / CONFIG_FILE)
-    number = record["format"]
-    if number != FORMAT:
-        raise MerlError(f"it has format {number}, but this version of merl reads format {FORMAT}")
-    return record
+    with readable(folder):
+        record: dict[str, Any] = read_json(folder / CONFIG_FILE)
+        number = record["format"]
+        if number != FORMAT:
+            raise MerlError(
+                f"it has format {number}, but this version of merl reads format {FORMAT}"
+            )
+        return record
 
 
 def write(folder: Path, record: Mapping[str, Any]) -> None:
@@ -80,15 +82,8 @@ def write(folder: Path, record: Mapping[str, Any]) -> None:
     Raises:
         MerlError: the folder cannot be written.
     """
-    part = folder / PART
-    try:
-        with open_file(part, "wb") as file:
-            file.write(json.dumps(sealed(record), indent=1).encode())
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(folder / CONFIG_FILE)
-    except OSError as error:
-        raise MerlError(f"{folder} is not writable: {error.strerror}") from None
+    with reporting(f"{folder} is not writable"):
+        replace_file(folder / CONFIG_FILE, json.dumps(sealed(record), indent=1).encode())
 
 
 def config_of(record: Mapping[str, Any]) -> TrainConfig:
@@ -158,5 +153,5 @@ def readable(folder: Path) -> Iterator[None]:
         if isinstance(error, KeyError):
             reason = f"it has no {error}"
         elif isinstance(error, OSError):
-            reason = error.strerror or reason
-        raise MerlError(f"{file} cannot be read: {reason}") from None
+            reason = cause(error)
+        raise MerlError(f"{file} cannot be read: {reason}") from error

@@ -12,7 +12,6 @@ curve.png       the learning curve, drawn when training ends
 from __future__ import annotations
 
 import dataclasses
-import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
@@ -26,9 +25,11 @@ from merl.agents.config import UnloadedConfig
 from merl.agents.networks import user_encoders
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import CONFIG_FILE, METRICS_FILE, MerlError, user_code
+from merl.core.files import is_gone, remove
 from merl.envs.user_env import imports_code, load_module
 from merl.replay.storage import holds_steps
 from merl.runs import record, trust
+from merl.runs.checkpoint_folders import folders
 from merl.runs.metrics import read_rows
 from merl.runs.plain import from_plain
 from merl.runs.provenance import machine
@@ -131,8 +132,8 @@ class Run:
             MerlError: the folder is not a run, or its config cannot be read.
         """
         path = existing_run(path)  # absolute, since user code may change the working folder
+        recorded = record.read(path)
         with record.readable(path):
-            recorded = record.read(path)
             config = record.config_of(recorded)
             record.spaces_of(recorded)
             record.machine_of(recorded)
@@ -249,15 +250,15 @@ class Run:
             Whether the folder was cleared. A run with a checkpoint, with metrics, or with steps in
             its replay buffer is left unchanged.
         """
-        if any(path.name.isdecimal() for path in self.checkpoints.glob("*")):
-            return False
         try:
-            if read_rows(self.path / METRICS_FILE)[1] or holds_steps(self.replay):
+            if folders(self.checkpoints) or read_rows(self.path / METRICS_FILE)[1]:
+                return False
+            if holds_steps(self.replay):
                 return False
         except (OSError, MerlError):  # damaged: it is not known to be empty
             return False
         for folder in (self.replay, self.checkpoints):
-            shutil.rmtree(folder, ignore_errors=True)
+            remove(folder)
         return True
 
     def check_there(self) -> None:
@@ -266,7 +267,7 @@ class Run:
         Raises:
             MerlError: the folder was removed or moved.
         """
-        if not (self.path / CONFIG_FILE).exists():
+        if is_gone(self.path / CONFIG_FILE):
             raise MerlError(
                 f"run folder {self.path} is gone: it was removed or moved during training; the run "
                 "stops and does not create it again"
@@ -311,5 +312,6 @@ class Run:
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
         """Return the recorded observation and action space; no environment is made."""
+        recorded = record.read(self.path)
         with record.readable(self.path):
-            return record.spaces_of(record.read(self.path))
+            return record.spaces_of(recorded)

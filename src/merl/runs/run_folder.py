@@ -15,15 +15,13 @@ from pathlib import Path
 
 from merl.config import Source, TrainConfig
 from merl.core import CONFIG_FILE, LOCK_FILE, METRICS_FILE, MerlError, suggest
-from merl.core.files import open_file, read_file
+from merl.core.files import cause, open_file, part_of, read_file, remove, reporting
 
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
 """Folder of the trained policies that come with merl: run folders without a replay."""
-PART = f".{CONFIG_FILE}.part"
-"""Temporary name of `config.json` while it is written."""
 ACTORS_FILE = "actors.json"
 """File in a run folder that names the actor of each ring of the replay."""
-_FILES = (METRICS_FILE, f".{METRICS_FILE}.part", CONFIG_FILE, PART, LOCK_FILE, ACTORS_FILE)
+_FILES = (METRICS_FILE, CONFIG_FILE, LOCK_FILE, ACTORS_FILE)
 _FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 
 
@@ -88,8 +86,9 @@ def refuse_existing(path: Path) -> None:
 def holds_nothing(path: Path) -> bool:
     """Return whether a folder holds at most the files that a run writes before its config."""
     try:
+        files = (LOCK_FILE, part_of(path / CONFIG_FILE).name)
         return path.is_dir() and all(
-            entry.name in (LOCK_FILE, PART) and not entry.is_symlink() for entry in path.iterdir()
+            entry.name in files and not entry.is_symlink() for entry in path.iterdir()
         )
     except OSError:  # the folder is not readable
         return False
@@ -106,7 +105,8 @@ def create_folder(config: TrainConfig, source: Source, home: Path | None) -> tup
     """
     while True:
         path = run_path(config, source, home)
-        refuse_existing(path)
+        if config.run_dir is not None:
+            refuse_existing(path)
         try:
             path.mkdir(parents=True)
         except FileExistsError:
@@ -114,7 +114,7 @@ def create_folder(config: TrainConfig, source: Source, home: Path | None) -> tup
                 continue  # another process has just taken this name
             return path, False
         except OSError as error:
-            raise MerlError(f"run folder {path} cannot be created: {error.strerror}") from None
+            raise MerlError(f"run folder {path} cannot be created: {cause(error)}") from error
         return path, True
 
 
@@ -124,7 +124,7 @@ def _exists(path: Path) -> bool:
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError as error:  # the name is too long, or a folder is not searchable
-        raise MerlError(f"run folder {path} cannot be used: {error.strerror}") from None
+        raise MerlError(f"run folder {path} cannot be used: {cause(error)}") from error
     return True
 
 
@@ -132,17 +132,19 @@ def check_links(run: Path) -> None:
     """Check that no link in a run leads out of its folder; an untrusted run may contain such links.
 
     Raises:
-        MerlError: there is such a link; the message names it.
+        MerlError: there is such a link, and the message names it; or the folder cannot be read.
     """
-    root = run.resolve()
-    for folder, folders, files in os.walk(run):
-        for name in (*folders, *files):
-            path = Path(folder, name)
-            if path.is_symlink() and not _lies_in(path, root):
-                raise MerlError(
-                    f"{path} is a link to {path.readlink()}, outside of the run, and merl does not "
-                    "write through it: replace the link by the file or folder that it points to"
-                )
+    with reporting(f"run folder {run} cannot be read"):
+        root = run.resolve()
+        for folder, folders, files in os.walk(run):
+            for name in (*folders, *files):
+                path = Path(folder, name)
+                if path.is_symlink() and not _lies_in(path, root):
+                    raise MerlError(
+                        f"{path} is a link to {path.readlink()}, outside of the run, and merl does "
+                        "not write through it: replace the link by the file or folder that it "
+                        "points to"
+                    )
 
 
 def _lies_in(link: Path, root: Path) -> bool:
@@ -161,11 +163,9 @@ def discard_folder(run: Path, created: bool) -> None:
         run: the folder.
         created: this process has created the folder, so the folder is deleted, too.
     """
-    for name in _FOLDERS:
-        shutil.rmtree(run / name, ignore_errors=True)
-    for name in _FILES:
-        with suppress(OSError):
-            (run / name).unlink(missing_ok=True)
+    for name in (*_FOLDERS, *_FILES):
+        remove(run / name)
+        remove(part_of(run / name))
     if created:
         with suppress(OSError):  # the folder holds files of others
             run.rmdir()
@@ -192,7 +192,7 @@ def lock_folder(run: Path) -> Iterator[None]:
         except FileNotFoundError:
             same = False
         except OSError as error:
-            raise MerlError(f"{path} cannot be locked: {error.strerror}") from None
+            raise MerlError(f"{path} cannot be locked: {cause(error)}") from error
         if not same:
             raise MerlError(f"run folder {run} was just removed by another process: try again")
         with suppress(OSError):  # a full disk; the lock is valid without the number

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from merl.core import MerlError
+from merl.core.files import replace_file
 from merl.envs.user_env import imports_code
 
 ENVIRONMENT = "environment"
@@ -106,9 +107,7 @@ def remember(record: Mapping[str, Any]) -> None:
     try:
         folder = _folder()
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        part = folder / f".{name}.{os.getpid()}.part"
-        part.write_text(json.dumps(asdict(stated)))
-        part.replace(folder / name)
+        replace_file(folder / name, json.dumps(asdict(stated)).encode())
     except OSError as error:
         _LOG.warning(
             "merl could not record that you trained this run (%s): to resume or evaluate it, "

@@ -10,10 +10,12 @@ from typing import Any
 from merl.acting.environments import Environments, WorkerDied
 from merl.callbacks import Callback
 from merl.core import EnvironmentsLost
+from merl.core.files import cause
 from merl.core.guards import LossGuard
 from merl.replay import ReplayBuffer
 from merl.runs import checkpoint
 from merl.runs.checkpoint import Checkpoint
+from merl.runs.checkpoint_folders import discard_later
 from merl.runs.plain import to_plain
 from merl.runs.run import Run
 from merl.training.evaluator import Evaluations
@@ -96,9 +98,8 @@ class Saver:
             )
         except OSError as error:
             self._run.check_there()
-            reason = error.strerror or error
             self._callbacks.on_warning(
-                f"the checkpoint at step {progress.step} was not written: {reason}"
+                f"the checkpoint at step {progress.step} was not written: {cause(error)}"
             )
             return False
         finally:
@@ -133,7 +134,7 @@ class Saver:
                 self._states = states if isinstance(states, list) else [states]
                 self._environments.restore(self._states)
                 self._clock.restore(float(state["seconds"]), float(state["cpu_seconds"]))
-            checkpoint.discard_later(self._run.checkpoints, start.step)
+            discard_later(self._run.checkpoints, start.step)
         except WorkerDied as died:
             raise EnvironmentsLost(
                 f"an environment's process {died} right after its start: see its output above"

@@ -16,7 +16,7 @@ from merl.core import MerlError, suggest
 from merl.core.fields import Range, check_value
 from merl.rendering.config import LARGEST_IMAGE, Samples, check_samples
 from merl.rendering.raster.scene import Scene, build_scene
-from merl.rendering.warp_runtime import compiling, start_warp
+from merl.rendering.warp_runtime import compiling, load_kernels, start_warp
 
 SHADOW_TEXELS = 1.5
 """Texels along an edge of a shadow map, per sample along an edge of the image."""
@@ -62,7 +62,7 @@ class RasterRenderer:
         self._allocate(size)
         self._describe_views()
         with compiling():
-            self._commands = self._record()
+            self._commands = load_kernels(self._record)
             self.render()
 
     def render(self) -> NDArray[np.uint8]:

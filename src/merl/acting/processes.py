@@ -30,10 +30,10 @@ class Processes(AsyncVectorEnv):
         finalizers = util._finalizer_registry  # type: ignore[attr-defined]
         unlink = SemLock._cleanup  # type: ignore[attr-defined]
         before = {*finalizers}
-        with signals_blocked():  # it keeps them blocked; else they end it, and it is missed later
+        with signals_blocked():  # it keeps them blocked: they must not end it
             resource_tracker.ensure_running()
         with ExitStack() as self._starting:
-            self._starting.enter_context(signals_blocked())
+            self._starting.enter_context(signals_blocked(_IGNORED_SIGNALS))
             super().__init__(*args, **options)
         # All processes have opened the semaphores, which no longer need names.
         for key in {*finalizers} - before:

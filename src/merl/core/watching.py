@@ -10,15 +10,17 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from merl.core.watcher import ENDING
 
 END_SECONDS = 9.0
 """Seconds in which environments must close and threads must end; see `ending`."""
-_LIBC = ctypes.CDLL(None)
+_LIBC, _RT = ctypes.CDLL(None), ctypes.CDLL("librt.so.1")
 _PR_SET_PDEATHSIG, _MFD_CLOEXEC, _CLOCK_MONOTONIC, _SIGEV_THREAD = 1, 1, 1, 2  # C headers
 _LAST = 0.3
 """Seconds between the printed line and the end of the process."""
@@ -30,13 +32,12 @@ def end_with_parent(number: int) -> None:
 
 
 @contextmanager
-def signals_blocked() -> Iterator[None]:
+def signals_blocked(numbers: Collection[int] = ENDING) -> Iterator[None]:
     """Start processes in this block: they keep these signals blocked until they are prepared.
 
-    The signals that this thread gets meanwhile arrive at the end of the block. SIGTERM is not
-    blocked: it can end a process that is still starting.
+    The signals that this thread gets meanwhile arrive at the end of the block.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING - {signal.SIGTERM})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:
@@ -55,43 +56,75 @@ def new_log() -> int:
 
 
 @contextmanager
-def watched(log: int, patience: float, text: str, *, waits: bool = False) -> Iterator[None]:
+def watched(log: int, patience: float, text: str) -> Iterator[None]:
     """Let a process watch this one during the block, see `merl.core.watcher.watch`."""
-    script = str(Path(__file__).with_name("watcher.py"))
-    # A session of its own: Ctrl-C does not reach it.
-    line = [sys.executable, "-I", "-S", script, str(os.getpid()), str(log), str(patience), text]
-    process = None
-    with suppress(OSError, subprocess.SubprocessError), signals_blocked():
-        process = subprocess.Popen(
-            [*line, str(int(waits))],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            pass_fds=[log],
-            start_new_session=True,
-        )
+    process = _start_watcher(log, patience, text)
     try:
         yield
     finally:
-        if process is not None:
-            process.kill()
-            process.wait()
+        _stop(process)
 
 
 @contextmanager
 def ending(code: int, text: str) -> Iterator[None]:
-    """End the process with an exit code if the block takes too long, and print a line then.
+    """End this process with an exit code if the block takes `END_SECONDS`, and print a line then.
 
-    The block may hang in C code, so another process prints and a thread of the C library ends this
-    process.
+    The block may hang in C code: another process prints, and a thread of the C library ends this
+    one.
     """
+    process, timer = _start_ending(code, text)
+    try:
+        yield
+    finally:
+        if timer is not None:
+            _RT.timer_delete(timer)
+        _stop(process)
+
+
+def end_soon(code: int) -> None:
+    """End this process with an exit code in `END_SECONDS` if it is still there, and print why.
+
+    Call it last: Python then waits for threads and calls exit handlers, which may hang.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # without a traceback
+    others = {*threading.enumerate()} - {threading.main_thread()}
+    names = ", ".join(thread.name for thread in others if not thread.daemon)
+    what = (
+        f"thread {names}, which did not end" if names else "an exit handler, which did not return"
+    )
+    _start_ending(code, f"merl: warning: ended without waiting for {what} within {END_SECONDS:g} s")
+
+
+def _start_ending(code: int, text: str) -> tuple[subprocess.Popen[bytes] | None, Any]:
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     null = os.open(os.devnull, os.O_RDONLY)
-    try:
-        with watched(null, END_SECONDS, text, waits=True), _exit_after(END_SECONDS + _LAST, code):
-            yield
-    finally:
-        os.close(null)
+    process = _start_watcher(null, END_SECONDS, text, waits=True)
+    os.close(null)
+    return process, _exit_after(END_SECONDS + _LAST, code)
+
+
+def _start_watcher(
+    log: int, patience: float, text: str, *, waits: bool = False
+) -> subprocess.Popen[bytes] | None:
+    """Start `merl.core.watcher` for this process; return None if that is impossible."""
+    script = str(Path(__file__).with_name("watcher.py"))
+    line = [sys.executable, "-I", "-S", script, str(os.getpid()), str(log), str(patience), text]
+    with suppress(OSError, subprocess.SubprocessError), signals_blocked():
+        return subprocess.Popen(
+            [*line, str(int(waits))],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            pass_fds=[log],
+            start_new_session=True,  # Ctrl-C does not reach it
+        )
+    return None
+
+
+def _stop(process: subprocess.Popen[bytes] | None) -> None:
+    if process is not None:
+        process.kill()
+        process.wait()
 
 
 class _Event(ctypes.Structure):
@@ -113,19 +146,13 @@ class _Time(ctypes.Structure):
     _fields_ = (("period", ctypes.c_long * 2), ("first", ctypes.c_long * 2))
 
 
-@contextmanager
-def _exit_after(seconds: float, code: int) -> Iterator[None]:
-    """Exit at once after some seconds, unless the block ends before; needs no GIL."""
+def _exit_after(seconds: float, code: int) -> Any:
+    """Let a thread of the C library exit at once after some seconds; return the timer."""
     function = ctypes.cast(_LIBC._exit, ctypes.c_void_p)
     event = _Event(value=code, kind=_SIGEV_THREAD, function=function)
     whole, rest = divmod(seconds, 1.0)
-    when = _Time(first=(int(whole), int(rest * 1e9)))
-    timer, rt = ctypes.c_void_p(), ctypes.CDLL("librt.so.1")
-    armed = rt.timer_create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0
-    if armed:
-        rt.timer_settime(timer, 0, ctypes.byref(when), None)
-    try:
-        yield
-    finally:
-        if armed:
-            rt.timer_delete(timer)
+    when, timer = _Time(first=(int(whole), int(rest * 1e9))), ctypes.c_void_p()
+    if _RT.timer_create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)):
+        return None
+    _RT.timer_settime(timer, 0, ctypes.byref(when), None)
+    return timer

@@ -97,7 +97,8 @@ def end_soon(code: int) -> None:
 
 def _start_ending(code: int, text: str) -> tuple[subprocess.Popen[bytes] | None, Any]:
     for stream in (sys.stdout, sys.stderr):
-        stream.flush()
+        with suppress(AttributeError, OSError, ValueError):  # None, or closed
+            stream.flush()
     null = os.open(os.devnull, os.O_RDONLY)
     process = _start_watcher(null, END_SECONDS, text, waits=True)
     os.close(null)
@@ -108,6 +109,8 @@ def _start_watcher(
     log: int, patience: float, text: str, *, waits: bool = False
 ) -> subprocess.Popen[bytes] | None:
     """Start `merl.core.watcher` for this process; return None if that is impossible."""
+    if not sys.executable:  # Python is embedded in another program
+        return None
     script = str(Path(__file__).with_name("watcher.py"))
     line = [sys.executable, "-I", "-S", script, str(os.getpid()), str(log), str(patience), text]
     with suppress(OSError, subprocess.SubprocessError), signals_blocked():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from merl.core import MerlError
+from merl.core.watcher import ENDING
 from merl.rendering.renderer import check_renderer
 
 # Environment of the processes that tests start: they share the cores with other tests, and their
@@ -19,7 +20,6 @@ os.environ |= {"OMP_NUM_THREADS": "1", "COLUMNS": "80", "LINES": "25", "TERM": "
 for _name in ("FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
     os.environ.pop(_name, None)
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 ALLOWED_SKIPS = (
     r"no OpenGL library works on this machine",
     r"this machine has CUDA",
@@ -61,7 +61,7 @@ def opengl() -> None:
 @pytest.fixture(autouse=True)
 def _no_signal_is_ignored() -> Iterator[None]:
     """Reset ignored signals (nohup, background jobs), since merl leaves them ignored."""
-    ignored = [number for number in SIGNALS if signal.getsignal(number) == signal.SIG_IGN]
+    ignored = [number for number in ENDING if signal.getsignal(number) == signal.SIG_IGN]
     for number in ignored:
         is_ctrl_c = number == signal.SIGINT
         signal.signal(number, signal.default_int_handler if is_ctrl_c else signal.SIG_DFL)

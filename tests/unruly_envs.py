@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import random
 import signal
+import threading
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -80,6 +82,23 @@ def one() -> Unruly:
 def wanders() -> Unruly:
     os.chdir("/")
     return make()
+
+
+class Unclosable(Unruly):
+    """Its `close` never returns."""
+
+    def close(self) -> None:
+        time.sleep(1000)
+
+
+def unclosable() -> Unclosable:
+    return Unclosable()
+
+
+def starts_a_thread() -> Unruly:
+    """Start a thread that never ends."""
+    threading.Thread(target=time.sleep, args=(1000,), name="camera").start()
+    return Unruly()
 
 
 # Values of `draw`.

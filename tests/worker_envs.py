@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -17,6 +18,13 @@ EPISODE = 10
 """Steps of an episode."""
 WORK = 0.02
 """Seconds that a step of `Slow` takes."""
+
+
+def hang_in_c() -> None:
+    """Wait for ever, with the GIL and whatever signals arrive: lock a mutex twice."""
+    mutex = ctypes.create_string_buffer(64)
+    for _ in range(2):
+        ctypes.PyDLL(None).pthread_mutex_lock(mutex)
 
 
 class Plain(gymnasium.Env[Any, Any]):
@@ -59,6 +67,8 @@ class Misbehaving(Plain):
         ):
             if self.what == "dies":
                 os.kill(os.getpid(), signal.SIGKILL)
+            if self.what == "hangs in C":
+                hang_in_c()
             if self.what == "stops":
                 os.kill(os.getpid(), signal.SIGSTOP)
             time.sleep(1000)
@@ -206,6 +216,10 @@ def dies() -> Plain:
 
 def hangs() -> Plain:
     return Misbehaving("hangs")
+
+
+def hangs_in_c() -> Plain:
+    return Misbehaving("hangs in C")
 
 
 def stops() -> Plain:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from safetensors.torch import load_file
 from helpers import flat, wait_for
 from merl import cli
 from merl.agents.ddpg import DDPG
+from merl.core.watcher import ENDING
 from merl.report.curves import read_metrics
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
@@ -205,48 +206,81 @@ def test_a_run_whose_workers_die_before_the_first_step_leaves_no_files(
     assert not run.exists()
 
 
-def test_workers_end_when_the_run_is_killed(tmp_path: Path) -> None:
-    flags = ("--steps", "2000000", "--num-envs", "2")
-    with started(tmp_path / "run", "slow", *flags) as process:
-        wait_for(lambda: saved(tmp_path / "run"), process)
+def test_nothing_is_left_when_the_run_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that hangs in C code ends, too; no shared memory and no message remain."""
+    monkeypatch.setenv("TIMES", "1")
+    with started(
+        tmp_path / "run", "hangs_in_c", "--steps", "2000000", "--num-envs", "2"
+    ) as process:
+        wait_for((tmp_path / "0").exists, process)
         children = psutil.Process(process.pid).children(recursive=True)
-        assert len(children) >= 2
+        assert len(children) >= 4  # with the watcher and the resource tracker
+        maps = Path(f"/proc/{process.pid}/maps").read_text().splitlines()
+        shared = [line for line in maps if "/dev/shm/" in line]
+        assert shared
+        assert all(line.endswith("(deleted)") for line in shared)
         process.kill()
-        _, alive = psutil.wait_procs(children, timeout=300)
-    assert not alive
+        deadline = time.monotonic() + 2.0
+        wait_for(lambda: time.monotonic() > deadline or not any(map(lives, children)))
+        assert not any(map(lives, children))
+        _, err = process.communicate()
+    assert err == ""
+
+
+def lives(process: psutil.Process) -> bool:
+    return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
 
 
 @pytest.mark.parametrize(
     "number",
     [
-        signal.SIGINT,
-        *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGTERM, signal.SIGUSR1)),
+        signal.SIGUSR1,
+        *(pytest.param(n, marks=pytest.mark.long) for n in sorted(ENDING - {signal.SIGUSR1})),
     ],
 )
 def test_a_signal_to_all_processes_saves(tmp_path: Path, number: int) -> None:
-    """A terminal or a batch system sends the signal to the workers, too."""
+    """A terminal or a batch system sends it to the workers and the resource tracker, too."""
     run = tmp_path / "run"
     with started(run, "slow", "--steps", "2000000", "--num-envs", "2") as process:
         wait_for(lambda: saved(run), process)
         os.killpg(process.pid, number)
-        out, _ = process.communicate()
+        out, err = process.communicate()
     assert process.returncode == 128 + number
     assert "and saved: resume with" in flat(out)
+    assert "Traceback" not in err
+    assert "resource_tracker" not in err
     assert cli.main(["resume", str(run), "--minutes", "0.02"]) == 0
 
 
+@pytest.mark.parametrize("phase", ["import", "make"])
 @pytest.mark.parametrize(
-    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+    "number",
+    [
+        signal.SIGINT,
+        *(pytest.param(n, marks=pytest.mark.long) for n in sorted(ENDING - {signal.SIGINT})),
+    ],
 )
-def test_a_signal_while_workers_start_ends_the_run_immediately(tmp_path: Path, number: int) -> None:
+def test_a_signal_while_workers_start_ends_the_run_immediately(
+    tmp_path: Path, number: int, phase: str
+) -> None:
+    def starting() -> bool:
+        with suppress(OSError):  # a process that has ended
+            lines = [Path(f"/proc/{child.pid}/cmdline").read_bytes() for child in main.children()]
+            return any(b"spawn_main" in line for line in lines)
+        return False
+
     run = tmp_path / "run"
     with started(run, "never_ready", "--steps", "100", "--num-envs", "2") as process:
-        wait_for((tmp_path / "waits").exists, process)
-        process.send_signal(number)
+        main = psutil.Process(process.pid)
+        wait_for(starting if phase == "import" else (tmp_path / "waits").exists, process)
+        os.killpg(process.pid, number)
         out, err = process.communicate()
     assert process.returncode == 128 + number
     assert "stopped before training began: nothing was written" in flat(out)
     assert "Traceback" not in err
+    assert "resource_tracker" not in err
     assert not run.exists()
 
 

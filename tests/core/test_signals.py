@@ -11,9 +11,10 @@ import time
 import pytest
 
 from merl.core.signals import Interrupt, handlers_kept
+from merl.core.watcher import ENDING, REPEATED
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
+@pytest.mark.parametrize("number", sorted(ENDING))
 def test_a_signal_is_recorded_and_the_former_handler_is_restored(number: int) -> None:
     former = signal.getsignal(number)
     with Interrupt().listening() as interrupt:
@@ -23,12 +24,13 @@ def test_a_signal_is_recorded_and_the_former_handler_is_restored(number: int) ->
     assert signal.getsignal(number) == former
 
 
-def test_a_second_sighup_does_not_end_the_process() -> None:
+@pytest.mark.parametrize("number", sorted(REPEATED))
+def test_a_second_signal_of_the_system_does_not_end_the_process(number: int) -> None:
     with Interrupt().listening() as interrupt:
-        os.kill(os.getpid(), signal.SIGHUP)
+        os.kill(os.getpid(), number)
         time.sleep(0.2)
-        os.kill(os.getpid(), signal.SIGHUP)
-        assert interrupt.number == signal.SIGHUP
+        os.kill(os.getpid(), number)
+        assert interrupt.number == number
 
 
 def test_one_signal_to_process_and_group_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,7 +51,7 @@ def test_an_ignored_signal_stays_ignored() -> None:
         signal.signal(signal.SIGHUP, former)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT])
 def test_a_second_signal_ends_the_process_immediately(number: int) -> None:
     program = (
         "import os, time; from merl.core.signals import Interrupt\n"

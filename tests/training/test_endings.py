@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -384,3 +387,29 @@ def test_evaluations_with_different_start_observations_give_a_warning(
     printed = capsys.readouterr()
     assert " ".join(printed.out.split()).count("start differently from those of the previous") == 1
     assert printed.err == ""
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        ("unclosable", r"close\(\) of the environment did not .*/run is trained and saved\n"),
+        ("starts_a_thread", "ended without waiting for thread camera.*\n"),
+    ],
+)
+def test_what_hangs_at_the_end_does_not_keep_the_process_alive(function: str, message: str) -> None:
+    program = (
+        "import sys; from merl.core import watching; watching.END_SECONDS = 0.3\n"
+        "from merl.cli import main; sys.exit(main())"
+    )
+    line = ["train", f"unruly_envs:{function}", *FLAGS, "--eval.no-references", "--run-dir", "run"]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *line],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+        capture_output=True,
+        check=False,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(f"merl: warning: {message}", done.stderr)
+    assert saved()[-1] == 60

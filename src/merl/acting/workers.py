@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
-import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from merl.acting.environments import Step, WorkerDied
 from merl.acting.generators import seed_global_generators
+from merl.acting.processes import Processes, belong_to
 from merl.acting.run_env import (
     EnvSpaces,
     environment_state,
@@ -41,9 +42,6 @@ _INFO = ("success", "reward_terms")
 """Keys of an environment's info that the training loop uses."""
 _INFO_KEY = "reported"
 """The only key of a worker's info; its value holds the `_INFO` entries of the environment."""
-_IGNORED_SIGNALS = (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
-"""Signals that workers ignore: a terminal or a batch system sends them to the workers, too, but the
-workers must continue until the run has saved and ends them. SIGTERM ends a worker."""
 START_SECONDS = 300.0
 """Time limit within which all processes must have made their environments."""
 END_SECONDS = 5.0
@@ -172,9 +170,7 @@ class WorkerEnvs:
             # The exception of a worker is raised here; Gymnasium must not print it as well.
             gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
             with _shared_memory(self.count):
-                return AsyncVectorEnv(
-                    makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED
-                )
+                return Processes(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
 
 
 def check_sendable(config: TrainConfig, make: MakeEnv | None) -> None:
@@ -316,14 +312,14 @@ class _Maker:
     folder: Path | None
     """The folder from which the module of a user's environment was loaded."""
     make: MakeEnv | None = None
+    parent: int = field(default_factory=os.getpid)
     safe_path: str | None = field(default_factory=users_value)
     """The user's value of `PYTHONSAFEPATH`, for Python processes that the environment starts."""
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
         if self.here is not None:
             return _StandIn(self.expected)
-        for number in _IGNORED_SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
+        belong_to(self.parent)
         if imports_code(self.config.task):
             set_value(self.safe_path)
         tolerate_lost_output()

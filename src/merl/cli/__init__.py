@@ -23,6 +23,7 @@ from merl.core import MerlError, suggest
 from merl.core.files import cause
 from merl.core.output import tolerant_output
 from merl.core.python_path import working_folder_hidden
+from merl.core.watching import end_soon
 
 COMMANDS = {
     "train": "train an agent on a task",
@@ -53,8 +54,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     A command continues if its output cannot be written. A command that only prints then returns a
     nonzero exit code.
     """
-    args = list(sys.argv[1:] if arguments is None else arguments)
-    only_prints = args[:1] not in (["train"], ["resume"], ["learner"], ["actor"])
+    if arguments is not None:
+        return _main(arguments)
+    code = _main(sys.argv[1:])
+    if not _only_prints(sys.argv[1:]):
+        end_soon(code)
+    return code
+
+
+def _only_prints(args: Sequence[str]) -> bool:
+    return args[:1] not in (["train"], ["resume"], ["learner"], ["actor"])
+
+
+def _main(arguments: Sequence[str]) -> int:
+    args = list(arguments)
+    only_prints = _only_prints(args)
     try:
         with tolerant_output() as (out, _), working_folder_hidden(), _warnings_on_stderr():
             code = _run(args)

@@ -16,7 +16,9 @@ from merl.cli.console import make_console
 from merl.cli.duration import duration
 from merl.cli.summary import summarize
 from merl.config import CUSTOM, Source, TrainConfig
-from merl.core import counted
+from merl.core import MerlError, counted
+from merl.core.signals import attended
+from merl.core.watching import END_SECONDS, ending
 from merl.experiments.cloning_first import clone_first
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint
@@ -29,6 +31,8 @@ from merl.training.setup import Setup
 from merl.training.trainer import Trainer
 
 DAY = 86_400.0  # seconds
+_STOPPING = "merl: stopping once the environment returns; a second signal (Ctrl-C) stops at once"
+_UNCLOSED = f"merl: warning: close() of the environment did not return within {END_SECONDS:g} s"
 Damaged = Literal["refuse", "skip"]
 """What to do with a replay of which a part is damaged."""
 
@@ -117,7 +121,8 @@ def _fit(
     """Train with the live view; the trainer and the files that it maps are gone at the end."""
     with ExitStack() as stack:
         view = LiveView(console, _scale(config))
-        with console.status("building the scene and timing this machine", spinner="line"):
+        status = console.status("building the scene and timing this machine", spinner="line")
+        with status, attended(_STOPPING):
             trainer = Trainer(
                 config, [view], source=source, resumed=resumed, skip_damaged=skip_damaged
             )
@@ -127,7 +132,28 @@ def _fit(
         seconds = trainer.setup.timing.seconds(trainer.config)
         if resumed is None and source.preset != "laptop" and seconds > DAY:
             console.print("that is more than a day: --preset laptop is made for such a machine")
-        return trainer.fit()
+        try:
+            outcome = trainer.fit()
+        except MerlError as error:
+            with ending(error.exit_code, f"{_UNCLOSED}; error: {error}"):
+                stack.close()
+            raise
+        with ending(*_end(outcome)):
+            stack.close()
+        return outcome
+
+
+def _end(outcome: Outcome) -> tuple[int, str]:
+    """Return exit code and line for a run whose environment cannot be closed."""
+    try:
+        outcome.check_saved()
+    except MerlError as error:
+        return error.exit_code, f"{_UNCLOSED}; error: {error}"
+    if outcome.signal is None:
+        return 0, f"{_UNCLOSED}; {outcome.run.path} is trained and saved"
+    stopped = f"stopped at step {outcome.progress.step:,} and saved"
+    line = resume_line(outcome.run.path)
+    return 128 + outcome.signal, f"{_UNCLOSED}; {stopped}: resume with `{line}`"
 
 
 def _scale(config: TrainConfig) -> dict[str, float]:

@@ -6,7 +6,6 @@ so the same call continues a sweep that was stopped.
 
 from __future__ import annotations
 
-import ctypes
 import fcntl
 import os
 import signal
@@ -30,6 +29,7 @@ from merl.core import (
 )
 from merl.core.files import read_json
 from merl.core.signals import Interrupt
+from merl.core.watching import end_with_parent
 from merl.experiments.experiment import PlannedRun
 from merl.runs.resume import left_open
 from merl.runs.run import Run
@@ -193,7 +193,7 @@ def _call(
             stderr=output,
             cwd=folder,
             start_new_session=True,
-            preexec_fn=_end_with_parent,
+            preexec_fn=lambda: end_with_parent(signal.SIGTERM),  # it saves
         )
     asked = False
     try:
@@ -207,15 +207,6 @@ def _call(
             process.terminate()
             process.wait()
     return process.returncode
-
-
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1
-
-
-def _end_with_parent() -> None:
-    """Let this process save and end when its parent process dies."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _reason(code: int, log: Path, begin: int) -> str:

@@ -1,0 +1,56 @@
+"""Worker processes that start undisturbed by signals, and that never outlive the run."""
+
+from __future__ import annotations
+
+import os
+import signal
+from contextlib import ExitStack
+from multiprocessing import resource_tracker, util
+from multiprocessing.synchronize import SemLock
+from typing import Any
+
+from gymnasium.vector import AsyncVectorEnv
+
+from merl.core.watcher import ENDING
+from merl.core.watching import end_with_parent, signals_blocked
+
+_IGNORED_SIGNALS = ENDING - {signal.SIGTERM}
+"""Signals that workers ignore: a terminal or a batch system sends them to the workers, too, but the
+workers must continue until the run has saved and ends them. SIGTERM ends a worker."""
+
+
+class Processes(AsyncVectorEnv):
+    """Environments in worker processes, each of which calls `belong_to`.
+
+    If this process is killed, nothing stays behind in `/dev/shm`, unless the processes were still
+    starting.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        finalizers = util._finalizer_registry  # type: ignore[attr-defined]
+        unlink = SemLock._cleanup  # type: ignore[attr-defined]
+        before = {*finalizers}
+        with signals_blocked():  # it keeps them blocked: they must not end it
+            resource_tracker.ensure_running()
+        with ExitStack() as self._starting:
+            self._starting.enter_context(signals_blocked(_IGNORED_SIGNALS))
+            super().__init__(*args, **options)
+        # All processes have opened the semaphores, which no longer need names.
+        for key in {*finalizers} - before:
+            if finalizers[key]._callback is unlink:
+                finalizers[key]()
+
+    def _check_spaces(self) -> None:
+        """Wait for the processes, which were all started before."""
+        self._starting.close()
+        super()._check_spaces()  # type: ignore[no-untyped-call]
+
+
+def belong_to(run: int) -> None:
+    """Prepare a worker process: it ends with the process of the run, and other signals do not."""
+    end_with_parent(signal.SIGKILL)
+    if os.getppid() != run:  # it has ended before
+        os._exit(1)
+    for number in _IGNORED_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _IGNORED_SIGNALS)

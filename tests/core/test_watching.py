@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +16,7 @@ import pytest
 
 from helpers import wait_for
 from merl.core.signals import PATIENCE
-from merl.core.watching import END_SECONDS
+from merl.core.watching import END_SECONDS, signals_blocked
 
 HANG = """
 import ctypes, os, signal, sys, threading, time
@@ -56,6 +58,22 @@ def running(program: str) -> Iterator[subprocess.Popen[str]]:
 def line_of(process: subprocess.Popen[str]) -> str:
     assert process.stderr is not None
     return process.stderr.readline()
+
+
+def test_a_handler_that_raises_is_called_after_the_start_of_a_process() -> None:
+    def start() -> None:
+        with signals_blocked():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+            begun.append(True)
+
+    begun: list[bool] = []
+    other = threading.Thread(target=time.sleep, args=(0.5,))  # it may receive the signal
+    other.start()
+    with pytest.raises(KeyboardInterrupt):
+        start()
+    assert begun
+    other.join()
 
 
 def is_gone(process: psutil.Process) -> bool:

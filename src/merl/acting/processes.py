@@ -34,11 +34,23 @@ class Processes(AsyncVectorEnv):
             resource_tracker.ensure_running()
         with ExitStack() as self._starting:
             self._starting.enter_context(signals_blocked(_IGNORED_SIGNALS))
-            super().__init__(*args, **options)
+            try:
+                super().__init__(*args, **options)
+            except BaseException:
+                self._kill()
+                raise
         # All processes have opened the semaphores, which no longer need names.
         for key in {*finalizers} - before:
             if finalizers[key]._callback is unlink:
                 finalizers[key]()
+
+    def _kill(self) -> None:
+        """End the processes; then there is nothing to close."""
+        self.closed = True
+        for process in getattr(self, "processes", ()):
+            if process.pid is not None:  # it was started
+                process.kill()
+                process.join()
 
     def _check_spaces(self) -> None:
         """Wait for the processes, which were all started before."""

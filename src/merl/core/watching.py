@@ -12,9 +12,10 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from merl.core.watcher import ENDING
@@ -37,13 +38,24 @@ def end_with_parent(number: int) -> None:
 def signals_blocked(numbers: Collection[int] = ENDING) -> Iterator[None]:
     """Start processes in this block: they keep these signals blocked until they are prepared.
 
-    The signals that this thread gets meanwhile arrive at the end of the block.
+    Handlers are called at the end of the block: one that raises must not leave a process that is
+    half started. (Other threads may receive the signals, so blocking them here is not enough.)
     """
+    arrived, former = list[int](), dict[int, Callable[[int, FrameType | None], Any]]()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            if callable(handler := signal.getsignal(number)):
+                former[number] = handler
+                signal.signal(number, lambda number, _: arrived.append(number))
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in former.items():
+            signal.signal(number, handler)
+        for number in arrived:
+            former[number](number, None)
 
 
 def new_log() -> int:

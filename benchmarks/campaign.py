@@ -180,8 +180,8 @@ def main(
             )
             for failure in row.failures:
                 print(f"  {failure}", flush=True)
-    if output is not None:
-        _write(output, rows)
+            if output is not None:
+                _write(output, rows)
     count = sum(row.at_operation + row.at_time for row in rows)
     failed = sum(len(row.failures) for row in rows)
     print(f"{count} kills, {failed} differences")

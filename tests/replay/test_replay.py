@@ -1044,7 +1044,7 @@ def test_damaged_directory_is_rejected(tmp_path):
 
 def test_file_in_place_of_the_directory_is_rejected(tmp_path):
     (tmp_path / "run").write_text("a file")
-    with pytest.raises(MerlError, match="cannot store a replay in"):
+    with pytest.raises(MerlError, match="cannot be opened: Not a directory"):
         make(tmp_path / "run" / "replay")
     assert (tmp_path / "run").read_text() == "a file"
 

@@ -358,7 +358,7 @@ def test_a_worker_compares_its_instance_with_the_first(monkeypatch: pytest.Monke
     monkeypatch.setattr(Changing, "instances", itertools.count())
     config = compose("smoke", f"{here}:Changing")
     expected = EnvSpaces.of(config, make_run_env(config))
-    monkeypatch.setattr("signal.signal", lambda *_: None)
+    monkeypatch.setattr("merl.acting.workers.belong_to", lambda _: None)
     worker = _Maker(config, 1, expected, None, None)()
     assert worker.observation_space == expected.observation
     with pytest.raises(MerlError, match="and that of worker 1: the actions' bounds"):

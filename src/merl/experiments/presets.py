@@ -86,7 +86,6 @@ _DEMOS = Preset(
         synchronous=True,
         demos_ratio=0.25,
         demos_pretrain=30_000,
-        demos_freeze=True,
         env=dataclasses.replace(
             _LAPTOP.config.env,
             observations=("image", "wrist", "proprio", "touch"),

@@ -122,6 +122,38 @@ def test_the_watching_process_ends_with_its_parent_and_not_by_signals() -> None:
         wait_for(lambda: is_gone(watcher))
 
 
+@pytest.mark.parametrize(
+    ("crash", "told"),
+    [
+        ("file.truncate(0)\n    mapped[0] = 1", "(SIGBUS): its disk failed or is full, or another"),
+        ("os.abort()", "C code crashed (Aborted); merl check"),
+        ("ctypes.string_at(0)", "C code crashed (Segmentation fault); merl check"),
+    ],
+)
+def test_a_crash_of_c_code_is_one_line_that_names_the_place(crash: str, told: str) -> None:
+    program = f"""
+import mmap, tempfile
+file = tempfile.TemporaryFile()
+file.truncate(4096)
+mapped = mmap.mmap(file.fileno(), 4096)
+with signals.Interrupt().listening():
+    print("ready", flush=True)
+    {crash}
+"""
+    with running(program) as process:
+        _, err = process.communicate(timeout=20)
+    assert process.returncode in (-signal.SIGBUS, -signal.SIGABRT, -signal.SIGSEGV)
+    (line,) = err.splitlines()
+    assert line.startswith("merl: error: File ")
+    assert told in line
+
+
+def test_a_process_that_is_killed_has_no_line_of_a_crash() -> None:
+    with running(LISTENING.format("free")) as process:
+        process.kill()
+        assert process.communicate(timeout=20)[1] == ""
+
+
 @pytest.mark.parametrize("where", ["session", "thread"])
 def test_no_process_watches_an_interactive_session_or_another_thread(where: str) -> None:
     program = """

@@ -6,6 +6,7 @@ Neither a signal handler of Python nor a thread runs then.
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import os
 import signal
 import subprocess
@@ -76,11 +77,29 @@ def new_log() -> int:
 @contextmanager
 def watched(log: int, patience: float, text: str) -> Iterator[None]:
     """Let a process watch this one during the block, see `merl.core.watcher.watch`."""
-    process = _start_watcher(log, patience, text)
+    with _crashes() as crash:
+        process = _start_watcher(log, crash, patience, text)
+        try:
+            yield
+        finally:
+            _stop(process)
+
+
+@contextmanager
+def _crashes() -> Iterator[int]:
+    """Yield the descriptor of a file in memory to which Python writes if C code crashes.
+
+    It stays empty if `faulthandler` was enabled before; then Python writes where it was told to.
+    """
+    file, ours = new_log(), not faulthandler.is_enabled()
+    if ours:
+        faulthandler.enable(file, all_threads=False)
     try:
-        yield
+        yield file
     finally:
-        _stop(process)
+        if ours:
+            faulthandler.disable()
+        os.close(file)
 
 
 @contextmanager
@@ -118,25 +137,26 @@ def _start_ending(code: int, text: str) -> tuple[subprocess.Popen[bytes] | None,
         with suppress(AttributeError, OSError, ValueError):  # None, or closed
             stream.flush()
     null = os.open(os.devnull, os.O_RDONLY)
-    process = _start_watcher(null, END_SECONDS, text, waits=True)
+    process = _start_watcher(null, null, END_SECONDS, text, waits=True)
     os.close(null)
     return process, _exit_after(END_SECONDS + _LAST, code)
 
 
 def _start_watcher(
-    log: int, patience: float, text: str, *, waits: bool = False
+    log: int, crash: int, patience: float, text: str, *, waits: bool = False
 ) -> subprocess.Popen[bytes] | None:
     """Start `merl.core.watcher` for this process; return None if that is impossible."""
     if not sys.executable:  # Python is embedded in another program
         return None
     script = str(Path(__file__).with_name("watcher.py"))
-    line = [sys.executable, "-I", "-S", script, str(os.getpid()), str(log), str(patience), text]
+    numbers = map(str, (os.getpid(), log, crash, patience))
+    line = [sys.executable, "-I", "-S", script, *numbers, text, str(int(waits))]
     with suppress(OSError, subprocess.SubprocessError), signals_blocked():
         return subprocess.Popen(
-            [*line, str(int(waits))],
+            line,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            pass_fds=[log],
+            pass_fds=[log, crash],
             start_new_session=True,  # Ctrl-C does not reach it
         )
     return None

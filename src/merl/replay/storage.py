@@ -36,6 +36,7 @@ from merl.core.resources import reserve_file, reserve_holes
 from merl.replay.spec import ReplaySpec
 
 _HEADER, _PART = "replay.json", "part"
+_WAY_OUT = "restore it from a copy, or use another folder (merl evaluate needs no replay)"
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,7 @@ def _check(folder: Path, spec: ReplaySpec) -> None:
         if not is_damage(error):
             raise
         raise MerlError(
-            f"{directory} holds a damaged replay ({_HEADER}: {_reason(error)}): use another folder"
+            f"{directory} holds a damaged replay ({_HEADER}: {_reason(error)}): {_WAY_OUT}"
         ) from error
     if not same:
         raise MerlError(
@@ -215,10 +216,10 @@ def _check(folder: Path, spec: ReplaySpec) -> None:
             if not is_damage(error):
                 raise
             raise MerlError(
-                f"{directory} holds a damaged replay ({file}: {_reason(error)}): use another folder"
+                f"{directory} holds a damaged replay ({file}: {_reason(error)}): {_WAY_OUT}"
             ) from error
         if size != rows * field.bytes or not size:
-            raise MerlError(f"{directory} holds a truncated replay ({file}): use another folder")
+            raise MerlError(f"{directory} holds a truncated replay ({file}): {_WAY_OUT}")
 
 
 def _reason(error: Exception) -> str:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import closing, contextmanager, redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,11 @@ from safetensors.torch import load_file
 
 from helpers import flat, wait_for
 from merl import cli
+from merl.acting.run_env import make_run_env, recipe
+from merl.acting.workers import WorkerEnvs
 from merl.agents.ddpg import DDPG
 from merl.core.watcher import ENDING
+from merl.experiments.presets import compose
 from merl.report.curves import read_metrics
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.run import Run
@@ -107,6 +110,22 @@ def test_a_run_with_workers_is_reproducible(
     assert train(tmp_path / "run", "plain", "--num-envs", "3", steps=150) == 0
     assert not (hostile / "imported").exists()
     assert weights(tmp_path / "run") == weights(three[0])
+
+
+def test_a_worker_process_does_not_import_torch() -> None:
+    config = compose("smoke", "merl.envs.dot:whole")
+    before = {process.pid for process in psutil.Process().children()}
+    with (
+        closing(make_run_env(config)) as here,
+        closing(WorkerEnvs(recipe(config), here, 1, 30.0)) as environments,
+    ):
+        assert environments.reset({0: 1})[0].keys() == here.observation_space.keys()
+        started = [p for p in psutil.Process().children() if p.pid not in before]
+        loaded = [file.path for p in started for file in p.memory_maps()]
+        (state,) = environments.states()
+    assert any("numpy" in path for path in loaded)
+    assert not any("torch" in path for path in loaded)
+    assert "torch" not in state["globals"]
 
 
 def test_an_asynchronous_run_is_reproducible_and_keeps_its_update_ratio(tmp_path: Path) -> None:

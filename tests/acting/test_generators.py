@@ -13,13 +13,14 @@ from dm_control import mjcf
 
 from merl.acting.environments import InProcessEnvs
 from merl.acting.generators import (
+    environment_state,
     global_state,
     held_by,
     kept_generators,
     seed_global_generators,
+    set_environment_state,
     set_global_state,
 )
-from merl.acting.run_env import environment_state, set_environment_state
 from merl.acting.workers import _Worker
 from toy import DotEnv
 

@@ -16,7 +16,8 @@ import torch
 from gymnasium import spaces
 
 import merl
-from merl.acting.run_env import EnvSpaces, key_lines, make_run_env, run_spaces
+from merl.acting.instances import EnvSpaces
+from merl.acting.run_env import key_lines, make_run_env, recipe, run_spaces
 from merl.acting.workers import _Maker
 from merl.agents import AGENTS
 from merl.cli import main
@@ -357,9 +358,9 @@ def test_a_worker_compares_its_instance_with_the_first(monkeypatch: pytest.Monke
     monkeypatch.setattr(Changing, "change", "bounds")
     monkeypatch.setattr(Changing, "instances", itertools.count())
     config = compose("smoke", f"{here}:Changing")
-    expected = EnvSpaces.of(config, make_run_env(config))
+    expected = EnvSpaces.of(make_run_env(config))
     monkeypatch.setattr("merl.acting.workers.belong_to", lambda _: None)
-    worker = _Maker(config, 1, expected, None, None)()
+    worker = _Maker(recipe(config), 1, expected, None, None)()
     assert worker.observation_space == expected.observation
     with pytest.raises(MerlError, match="and that of worker 1: the actions' bounds"):
         worker.reset()

@@ -13,9 +13,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.acting.generators import seed_global_generators
-from merl.acting.run_env import (
+from merl.acting.generators import (
     environment_state,
+    seed_global_generators,
     set_environment_state,
 )
 from merl.core import Observation

@@ -8,6 +8,7 @@ at its end, together with the generators of its environment.
 from __future__ import annotations
 
 import base64
+import json
 import random
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -17,7 +18,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 
 
@@ -25,7 +25,8 @@ def seed_global_generators(seed: int) -> None:
     """Seed the global generators of NumPy, Python and torch."""
     random.seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 (environments use this generator)
-    torch.manual_seed(seed)
+    if (torch := _torch()) is not None:
+        torch.manual_seed(seed)
 
 
 def global_state() -> dict[str, Any]:
@@ -36,11 +37,10 @@ def global_state() -> dict[str, Any]:
         name: part.tolist() if isinstance(part, np.ndarray) else part
         for name, part in numpy["state"].items()
     }
-    return {
-        "python": [version, list(words), gauss],
-        "numpy": numpy,
-        "torch": base64.b64encode(torch.get_rng_state().numpy().tobytes()).decode(),
-    }
+    state = {"python": [version, list(words), gauss], "numpy": numpy}
+    if (torch := _torch()) is not None:
+        state["torch"] = base64.b64encode(torch.get_rng_state().numpy().tobytes()).decode()
+    return state
 
 
 def set_global_state(state: Mapping[str, Any]) -> None:
@@ -48,8 +48,48 @@ def set_global_state(state: Mapping[str, Any]) -> None:
     version, words, gauss = state["python"]
     random.setstate((version, tuple(words), gauss))
     np.random.set_state({**state["numpy"]})  # noqa: NPY002
-    data = bytearray(base64.b64decode(state["torch"]))
-    torch.set_rng_state(torch.frombuffer(data, dtype=torch.uint8))
+    if "torch" in state:
+        import torch
+
+        data = bytearray(base64.b64decode(state["torch"]))
+        torch.set_rng_state(torch.frombuffer(data, dtype=torch.uint8))
+
+
+def _torch() -> Any:
+    """Return torch if something has imported it, else None: importing it takes seconds."""
+    return sys.modules.get("torch")
+
+
+def environment_state(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return the state of an environment's random generators, as plain types.
+
+    An environment with other generators has different episodes after a resume.
+
+    Returns:
+        The state of the environment's `np_random` (`bit_generator` is one of its keys), empty if
+        the environment does not use it, and under `globals` the state of the global generators of
+        the process.
+    """
+    state: dict[str, Any] = {}
+    # Gymnasium's property `np_random` makes a generator on access; this attribute does not.
+    generator = getattr(env.unwrapped, "_np_random", None)
+    if isinstance(generator, np.random.Generator):
+        state = dict(generator.bit_generator.state)
+        try:
+            json.dumps(state)
+        except TypeError:
+            state = {}
+    return state | {"globals": global_state()}
+
+
+def set_environment_state(env: gymnasium.Env[Any, Any], state: Mapping[str, Any] | None) -> None:
+    """Restore from `environment_state()`."""
+    own = dict(state or {})
+    shared = own.pop("globals", None)
+    if shared is not None:
+        set_global_state(shared)
+    if own:
+        env.unwrapped.np_random.bit_generator.state = own
 
 
 @contextmanager
@@ -62,7 +102,8 @@ def kept_generators(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
     """
     restore = [*_restorers(env)]
     shared = global_state()
-    on_cuda = torch.cuda.is_available() and torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    torch = _torch()
+    on_cuda = torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized()
     cuda = torch.cuda.get_rng_state() if on_cuda else None
     try:
         yield
@@ -70,7 +111,7 @@ def kept_generators(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
         for restore_one in restore:
             restore_one()
         set_global_state(shared)
-        if cuda is not None:
+        if on_cuda:
             torch.cuda.set_rng_state(cuda)
 
 
@@ -145,7 +186,7 @@ def _restorer(value: Any) -> Callable[[], object] | None:
     if isinstance(value, random.Random) and not isinstance(value, random.SystemRandom):
         words = value.getstate()
         return lambda: value.setstate(words)
-    if isinstance(value, torch.Generator):
+    if (torch := _torch()) is not None and isinstance(value, torch.Generator):
         tensor = value.get_state()
         return lambda: value.set_state(tensor)
     return None

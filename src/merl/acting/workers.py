@@ -7,7 +7,7 @@ import os
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Timer
@@ -21,22 +21,19 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 
 from merl.acting.environments import Step, WorkerDied
-from merl.acting.generators import seed_global_generators
-from merl.acting.processes import Processes, belong_to
-from merl.acting.run_env import (
-    EnvSpaces,
+from merl.acting.generators import (
     environment_state,
-    make_run_env,
+    seed_global_generators,
     set_environment_state,
 )
-from merl.agents.config import ObservationConfig
-from merl.config import TrainConfig
+from merl.acting.instances import EnvRecipe, EnvSpaces, with_keys
+from merl.acting.processes import Processes, belong_to
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
 from merl.core.files import cause
 from merl.core.output import tolerate_lost_output
 from merl.core.python_path import set_value, users_value, working_folder_hidden
 from merl.core.user_code import in_one_line, module_folder
-from merl.envs.user_env import MakeEnv, imports_code, load_module
+from merl.envs.user_env import imports_code, load_module
 
 _INFO = ("success", "reward_terms")
 """Keys of an environment's info that the training loop uses."""
@@ -56,20 +53,21 @@ class WorkerEnvs:
     starts all of them again.
 
     Args:
-        config: the config of the run; uses `num_envs` and `worker_timeout` (seconds).
-        here: the same environment in this process; only its spaces are used.
-        make: makes the environment, in place of `config.task`; see `check_sendable`.
+        recipe: how to make them; see `check_sendable`.
+        here: the same environment in this process, with the keys that the agent uses; only its
+            spaces are used.
+        count: number of environments.
+        timeout: time limit of a step and of a reset, seconds.
 
     Raises:
         EnvironmentsLost: the processes cannot be started.
     """
 
     def __init__(
-        self, config: TrainConfig, here: gymnasium.Env[Any, Any], make: MakeEnv | None = None
+        self, recipe: EnvRecipe, here: gymnasium.Env[Any, Any], count: int, timeout: float
     ) -> None:
-        self._make = make
-        self.count, self.action_shape = config.num_envs, here.action_space.shape or ()
-        self._config, self._here, self._timeout = config, here, config.worker_timeout
+        self.count, self.action_shape = count, here.action_space.shape or ()
+        self._recipe, self._here, self._timeout = recipe, here, timeout
         self._lost: str | None = None  # why a process is lost
         try:
             self._env = self._started()
@@ -149,15 +147,9 @@ class WorkerEnvs:
 
     def _started(self) -> AsyncVectorEnv:
         self._lost = None
-        expected = EnvSpaces.of(self._config, self._here)
-        folder, config = module_folder(self._config.task), self._config
-        if ":" in config.agent_name:  # a worker does not need the user's class of config
-            agent = config.agent
-            keys = ObservationConfig(agent.keys, agent.modalities, agent.privileged)
-            config = replace(config, agent=keys)
+        expected, folder = EnvSpaces.of(self._here), module_folder(self._recipe.task)
         makers = [
-            _Maker(config, index, expected, self._here, folder, self._make)
-            for index in range(self.count)
+            _Maker(self._recipe, index, expected, self._here, folder) for index in range(self.count)
         ]
         others = multiprocessing.active_children()
         with (
@@ -173,19 +165,19 @@ class WorkerEnvs:
                 return Processes(makers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
 
 
-def check_sendable(config: TrainConfig, make: MakeEnv | None) -> None:
-    """Check that worker processes can receive the function that makes their environments.
+def check_sendable(recipe: EnvRecipe, count: int) -> None:
+    """Check that `count` worker processes can receive the function that makes their environments.
 
     Raises:
         MerlError: the function refers to something that exists in this process alone.
     """
     try:
-        pickle.dumps(CloudpickleWrapper(lambda: make))  # as AsyncVectorEnv sends it
+        pickle.dumps(CloudpickleWrapper(lambda: recipe.make))  # as AsyncVectorEnv sends it
     except Exception as error:
         raise MerlError(
-            f"{config.task} cannot be sent to the worker processes of num-envs "
-            f"{config.num_envs} ({in_one_line(error)}): let the function make all that it uses, or "
-            "use num-envs 1 and synchronous"
+            f"{recipe.task} cannot be sent to the worker processes of num-envs {count} "
+            f"({in_one_line(error)}): let the function make all that it uses, or use num-envs 1 "
+            "and synchronous"
         ) from None
 
 
@@ -305,13 +297,12 @@ class _StandIn(gymnasium.Env[Any, Any]):
 class _Maker:
     """A function that makes an environment in a worker process."""
 
-    config: TrainConfig
+    recipe: EnvRecipe
     index: int
     expected: EnvSpaces
     here: gymnasium.Env[Any, Any] | None
     folder: Path | None
     """The folder from which the module of a user's environment was loaded."""
-    make: MakeEnv | None = None
     parent: int = field(default_factory=os.getpid)
     safe_path: str | None = field(default_factory=users_value)
     """The user's value of `PYTHONSAFEPATH`, for Python processes that the environment starts."""
@@ -320,15 +311,15 @@ class _Maker:
         if self.here is not None:
             return _StandIn(self.expected)
         belong_to(self.parent)
-        if imports_code(self.config.task):
+        if imports_code(self.recipe.task):
             set_value(self.safe_path)
         tolerate_lost_output()
         with _picklable_errors():
             if self.folder is not None:
-                load_module(self.config.task, self.folder)
-            env = make_run_env(self.config, self.make)
+                load_module(self.recipe.task, self.folder)
+            env = with_keys(self.recipe.instance(), self.expected.observation.keys())
         try:
-            self.expected.check(EnvSpaces.of(self.config, env), f"that of worker {self.index}")
+            self.expected.check(EnvSpaces.of(env), f"that of worker {self.index}")
         except MerlError as error:
             env.close()
             env = _StandIn(self.expected, EnvironmentFailed(str(error)))

@@ -19,7 +19,7 @@ from rich.table import Table
 from merl.accelerate.speed_up import speed_up
 from merl.acting.environments import Environments, InProcessEnvs
 from merl.acting.rollout import FrameStack
-from merl.acting.run_env import make_run_env, run_spaces, run_spec
+from merl.acting.run_env import make_run_env, recipe, run_spaces, run_spec
 from merl.acting.workers import WorkerEnvs
 from merl.agents import make_agent
 from merl.agents.config import AgentConfig
@@ -152,7 +152,9 @@ class _Loop:
         stack.callback(env.close)
         space, actions = run_spaces(config, env)
         environments: Environments = (
-            WorkerEnvs(config, env) if config.has_workers else InProcessEnvs(env)
+            WorkerEnvs(recipe(config), env, config.num_envs, config.worker_timeout)
+            if config.has_workers
+            else InProcessEnvs(env)
         )
         stack.callback(environments.close)
         device, frames = choose_device(config.device), config.replay.frame_stack

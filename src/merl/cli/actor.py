@@ -13,7 +13,8 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from merl.acting.run_env import make_run_env, own_bounds, run_spaces
+from merl.acting.instances import own_bounds
+from merl.acting.run_env import make_run_env, run_spaces
 from merl.cli.console import make_console
 from merl.cli.parsing import parse
 from merl.cli.run import Stop

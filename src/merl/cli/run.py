@@ -20,7 +20,7 @@ import tyro
 from gymnasium import spaces
 from rich.console import Console
 
-from merl.acting.run_env import own_bounds
+from merl.acting.instances import own_bounds
 from merl.cli.console import make_console
 from merl.cli.parsing import RunOptions, parse
 from merl.cli.running import tell_trusted

@@ -15,8 +15,9 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from merl.acting.instances import own_bounds
 from merl.acting.rollout import FrameStack
-from merl.acting.run_env import make_run_env, own_bounds, run_spaces
+from merl.acting.run_env import make_run_env, run_spaces
 from merl.agents import make_agent
 from merl.config import TrainConfig
 from merl.core import Agent, MerlError, NotFinite, Observation

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from merl.acting.instances import own_bounds
 from merl.acting.rollout import Episode
-from merl.acting.run_env import own_bounds
 from merl.acting.still import StillEnv
 from merl.callbacks import Callback
 from merl.config import TrainConfig

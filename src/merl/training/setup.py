@@ -17,7 +17,8 @@ from gymnasium import spaces
 from merl.accelerate.speed_up import speed_up
 from merl.acting.env_checks import check_instances
 from merl.acting.environments import Environments, InProcessEnvs
-from merl.acting.run_env import EnvSpaces, make_run_env, run_spaces, run_spec
+from merl.acting.instances import EnvSpaces
+from merl.acting.run_env import make_run_env, recipe, run_spaces, run_spec
 from merl.acting.still import StillEnvs
 from merl.acting.workers import WorkerEnvs, check_sendable
 from merl.agents import AGENTS, make_agent
@@ -116,7 +117,8 @@ class Setup:
         if self.imitates or self.config.has_actors:
             return StillEnvs(self.space, self.action_space, self.config.num_envs)
         if self.config.has_workers:
-            return WorkerEnvs(self.config, self.env, self.make)
+            count, timeout = self.config.num_envs, self.config.worker_timeout
+            return WorkerEnvs(recipe(self.config, self.make), self.env, count, timeout)
         return InProcessEnvs(self.env)
 
     @property
@@ -172,7 +174,7 @@ class Setup:
             for name in user_encoders(config.agent):
                 user_code.load_module(name, home, kind="encoder")
         if config.has_workers:
-            check_sendable(config, make)
+            check_sendable(recipe(config, make), config.num_envs)
         with ExitStack() as stack:
             env = make_run_env(config, make)
             stack.callback(env.close)
@@ -191,8 +193,8 @@ class Setup:
                 mode = None if config.has_user_env and config.eval.video == "none" else "rgb_array"
                 eval_env = make_run_env(config.evaluated, make, render_mode=mode, render_size=size)
                 stack.callback(eval_env.close)
-                expected = EnvSpaces.of(config, env)
-                expected.check(EnvSpaces.of(config, eval_env), "the one for evaluations")
+                expected = EnvSpaces.of(env)
+                expected.check(EnvSpaces.of(eval_env), "the one for evaluations")
                 if config.has_user_env:
                     check_instances(env, eval_env)
             yield cls(config, env, eval_env, home, replay_spec, make)

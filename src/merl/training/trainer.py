@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from threading import Lock
 
+from merl.acting.instances import own_bounds
 from merl.acting.rollout import FrameStack, mean_metrics, report_success
-from merl.acting.run_env import own_bounds
 from merl.callbacks import Callback, CallbackList
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import EnvironmentsLost, EvaluationFailed, MerlError, counted

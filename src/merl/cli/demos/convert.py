@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 from gymnasium import spaces
 
-from merl.acting.run_env import own_bounds
+from merl.acting.instances import own_bounds
 from merl.cli.console import make_console
 from merl.cli.demos.shared import EnvOptions, FolderOptions, describe, make, tell_line, with_env
 from merl.cli.parsing import parse

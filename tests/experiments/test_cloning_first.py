@@ -92,6 +92,25 @@ def test_frozen_encoders_stay_as_cloning_left_them(train: list[str], tmp_path: P
     assert policy(run, 600)[encoders[0]].equal(cloned[encoders[0]])
 
 
+def test_agent_ibrl_keeps_the_cloned_policy_and_resumes_exactly(
+    train: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [*train, "--agent", "ibrl", "--demos-pretrain", "250", "--keep", "9", "--resume"]
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    assert main([*command, "--steps", "750", "--run-dir", str(whole)]) == 0
+    assert main([*command, "--run-dir", str(run)]) == 0
+    assert main([*command, "--steps", "750", "--run-dir", str(run)]) == 0
+    learnt, resumed = weights(whole, 750), weights(run, 750)
+    assert all(value.equal(learnt[name]) for name, value in resumed.items())
+    for name, value in weights(run.with_name("run-bc"), 250).items():
+        if name.startswith("networks.actor."):
+            own, kept = (name.replace("actor", part, 1) for part in ("actor", "imitator.actor"))
+            assert learnt[kept].equal(value)
+            assert not learnt[own].equal(value)
+    assert main(["export", str(run), "--to", "numpy", "--out", str(tmp_path / "p.py")]) == 2
+    assert "a policy of agent ibrl chooses by its critic" in flat(capsys.readouterr().err)
+
+
 @pytest.mark.parametrize(
     ("options", "line"),
     [

@@ -15,6 +15,7 @@ from merl.agents.bc import BC, BCConfig
 from merl.agents.config import ObservationConfig
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.drqv2 import DrQV2Config
+from merl.agents.ibrl import IBRL, IBRLConfig
 from merl.agents.merl import MERLConfig
 from merl.agents.sac import SAC, SACConfig
 from merl.core import Agent, MerlError, check_choice, suggest
@@ -45,7 +46,9 @@ AGENTS = {
     # Two baselines of the paper's argument: proprioception alone, and MERL on the state.
     "proprio": AgentKind(MERLConfig(modalities=("vector", "sequence")), DDPG),
     "merl_state": AgentKind(MERLConfig(keys=("state",)), DDPG),
+    # Two that learn from demonstrations: from them alone, and beside own experience.
     "bc": AgentKind(BCConfig(), BC, imitates=True),
+    "ibrl": AgentKind(IBRLConfig(), IBRL),
 }
 """The agents of merl."""
 METHODS = ("act", "update", "state_dict", "load_state_dict", "load_policy")

@@ -41,6 +41,7 @@ class Networks(nn.Module):
         actor: pi_theta.
         policy_average: moving average of the actor and its fusion, which acts in evaluation and
             deployment; None if the newest weights act.
+        imitator: copy of the policy that a run starts with; None if the agent has none.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Networks(nn.Module):
         self.actor_fusion = actor_fusion
         self.actor = actor
         self.policy_average: nn.ModuleDict | None = None
+        self.imitator: nn.ModuleDict | None = None
 
     @property
     def senses(self) -> tuple[str, ...]:
@@ -92,8 +94,17 @@ class Networks(nn.Module):
 
     def start_average(self) -> None:
         """Start the moving average of the actor and its fusion, as a copy of them."""
-        recent = nn.ModuleDict({"fusion": self.fusion_of_actor(), "actor": self.actor})
-        self.policy_average = copy.deepcopy(recent).requires_grad_(False)
+        self.policy_average = self._copy_of_actor()
+
+    def start_imitator(self) -> None:
+        """Keep a copy of the actor and its fusion as they are now."""
+        self.imitator = self._copy_of_actor()
+
+    def imitated(self, encoded: Mapping[str, Tensor]) -> Tensor:
+        """Return the actions (B, A) of that copy."""
+        assert self.imitator is not None
+        action: Tensor = self.imitator["actor"](self.imitator["fusion"](encoded))
+        return action
 
     @torch.no_grad()
     def update_average(self, tau: float) -> None:
@@ -119,10 +130,16 @@ class Networks(nn.Module):
         self.actor.load_state_dict(actor.state_dict())
         if self.policy_average is not None:
             self.start_average()
+        if self.imitator is not None:
+            self.start_imitator()
 
     def fusion_of_actor(self) -> Fusion | Concatenation:
         """Return the fusion that the actor uses: its own, or the critic's."""
         return self.critic_fusion if self.actor_fusion is None else self.actor_fusion
+
+    def _copy_of_actor(self) -> nn.ModuleDict:
+        parts = nn.ModuleDict({"fusion": self.fusion_of_actor(), "actor": self.actor})
+        return copy.deepcopy(parts).requires_grad_(False)
 
 
 def make_networks(

@@ -57,6 +57,11 @@ class Deployed(nn.Module):
                 "only the policies of merl's own agents can be exported: export yours with torch"
             )
         networks = agent.networks.cpu().eval()
+        if networks.imitator is not None:
+            raise MerlError(
+                "a policy of agent ibrl chooses by its critic, which merl export does not write: "
+                "export one of agent merl that starts from it (--agent.start-from RUN)"
+            )
         average = networks.policy_average
         self.encoders = networks.encoders
         self.fusion = networks.fusion_of_actor() if average is None else average["fusion"]

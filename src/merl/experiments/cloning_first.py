@@ -14,6 +14,7 @@ from merl.agents import AGENTS
 from merl.agents.bc import BCConfig
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
+from merl.agents.ibrl import IBRL
 from merl.config import ActorsConfig, Source, TrainConfig, override
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import IMITATING
@@ -56,7 +57,7 @@ def clone_first(
     exists = (cloned / CONFIG_FILE).exists()
     result = go_on(Run.open(cloned), first) if exists else begin(first)
     agent = override(config.agent, {"start_from": cloned})
-    if config.demos_freeze:
+    if _freezes(config):
         keys, _ = Run.open(cloned).spaces()
         trained = tuple(key for key in keys if key not in agent.privileged)
         agent = override(agent, {"frozen_encoders": trained})
@@ -68,15 +69,19 @@ def starts_cloned(config: TrainConfig, run: Run) -> TrainConfig:
     """Return the config with which a run that `clone_first` prepared is resumed."""
     if not config.demos_pretrain:
         return config
-    names = ("start_from", "frozen_encoders") if config.demos_freeze else ("start_from",)
+    names = ("start_from", "frozen_encoders") if _freezes(config) else ("start_from",)
     begun = {name: getattr(run.config.agent, name, None) for name in names}
     return replace(config, demos_pretrain=0, agent=override(config.agent, begun))
+
+
+def _freezes(config: TrainConfig) -> bool:
+    return config.demos_freeze or config.agent_name == "ibrl"
 
 
 def _cloning(config: TrainConfig, folder: Path) -> TrainConfig:
     """Return the config of agent `bc` with the same networks, for as many updates as asked."""
     agent, kind = config.agent, AGENTS.get(config.agent_name)
-    if kind is None or kind.make is not DDPG or not isinstance(agent, AgentConfig):
+    if kind is None or kind.make not in (DDPG, IBRL) or not isinstance(agent, AgentConfig):
         raise MerlError(
             f"demos-pretrain {config.demos_pretrain} clones into MERL's actor, which agent "
             f"{config.agent_name} does not have: use --demos-pretrain 0"

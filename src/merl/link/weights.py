@@ -63,11 +63,13 @@ def load(agent: Agent, form: list[Any], data: bytearray) -> None:
 
 
 def _needed(agent: Agent) -> Mapping[str, Tensor]:
-    """Return all weights but those of the critic and of the average that acts without noise."""
+    """Return the weights that act with noise: the critic's only if it chooses between actions."""
     networks = _networks(agent)
-    left_out = ["critic.", "policy_average."]
-    if networks.actor_fusion is not None:
-        left_out.append("critic_fusion.")
+    left_out = ["policy_average."]
+    if networks.imitator is None:
+        left_out.append("critic.")
+        if networks.actor_fusion is not None:
+            left_out.append("critic_fusion.")
     return {
         name: tensor
         for name, tensor in networks.state_dict().items()

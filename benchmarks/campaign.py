@@ -360,8 +360,7 @@ def _record(folder: Path) -> Path:
 def _make_runs_short() -> None:
     """Import what a run imports, so that its fork need not; leave out timing and drawing."""
     torch.set_num_threads(1)
-    for name in ("scipy.stats", "merl.cli.train"):
-        import_module(name)
+    import_module("merl.cli.train")
     timing = Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
     vars(merl.training.setup)["measure"] = lambda *_: timing
     vars(merl.report.figures)["learning_curve"] = lambda _, to, **__: to

@@ -1,5 +1,9 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from scipy import stats
 
 from merl.core.statistics import Interval, bootstrap_interval, wilson_interval
 
@@ -38,13 +42,31 @@ def test_bootstrap_refuses_empty_and_non_finite_samples(values):
         bootstrap_interval(values)
 
 
+@pytest.mark.parametrize("size", [2, 7, 50])
+def test_bootstrap_is_that_of_scipy(size):
+    values = np.random.default_rng(3).normal(5, 2, size)
+    expected = stats.bootstrap(
+        (values,), np.mean, n_resamples=9_999, method="percentile", rng=np.random.default_rng(0)
+    ).confidence_interval
+    interval = bootstrap_interval(values)
+    assert (interval.low, interval.high) == pytest.approx((expected.low, expected.high), rel=1e-12)
+
+
 @pytest.mark.parametrize(("successes", "n"), [(0, 10), (3, 10), (25, 50), (10, 10), (1, 1)])
-def test_wilson_against_its_formula(successes, n):
-    z, p = 1.959963984540054, successes / n
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+def test_wilson_is_that_of_scipy(successes, n):
+    expected = stats.binomtest(successes, n).proportion_ci(0.95, method="wilson")
+    expected = (successes / n, expected.low, expected.high)
     interval = wilson_interval(successes, n)
-    assert interval == pytest.approx((p, centre - half, centre + half), abs=1e-9)
+    assert interval == pytest.approx(expected, abs=1e-12)
+    assert 0 <= interval.low <= interval.mean <= interval.high <= 1
+
+
+def test_the_intervals_need_not_import_scipy():
+    code = (
+        "import sys; from merl.core.statistics import *; wilson_interval(1, 3); "
+        "bootstrap_interval([1, 2]); sys.exit('scipy' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_wilson_of_no_success_by_hand():

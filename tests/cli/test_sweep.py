@@ -21,6 +21,7 @@ SWEEP = """
 tasks = ["sweep_env:make"]
 preset = "smoke"
 [values]
+threads = 1
 steps = 1_000
 random_steps = 100
 seed_steps = 100
@@ -29,7 +30,9 @@ save_every = 1.0
 eval.every = 1_000
 eval.episodes = 2
 eval.video = "none"
+eval.references = false
 replay.batch_size = 16
+agent.precision = "fp32"
 agent.hidden_dim = 16
 agent.keys = ["joint"]
 [variants.one]

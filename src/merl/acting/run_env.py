@@ -35,9 +35,9 @@ def make_run_env(
     """
     if config.has_user_env:
         changes.pop("render_size", None)
-        if refused := changes.keys() - {"render_mode"}:
+        if refused := sorted(changes.keys() - {"render_mode"}):
             raise MerlError(
-                f"{', '.join(sorted(refused))} is for merl's own tasks only: {config.task} sets its own "
+                f"{', '.join(refused)} is for merl's own tasks only: {config.task} sets its own "
                 "observations; leave the option out"
             )
     env = recipe(config, make).instance(**changes)

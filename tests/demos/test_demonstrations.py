@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import random
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,10 @@ def damage(folder: Path, how: str) -> None:
             del content["episodes"][1]["file"]
         case "format":
             content["format"] = 9
+        case "return":
+            content["episodes"][1]["returned"] = np.inf
+        case "size":
+            content["observation_space"]["image"]["shape"] = [10**12]
         case "folder outside":
             content["episodes"][1]["file"] = "../../secret.npz"
         case "empty":
@@ -157,6 +162,8 @@ def damage(folder: Path, how: str) -> None:
         ("NaN", "00001.npz contains NaN or infinity"),
         ("length", "has . steps, and demos.json says"),
         ("key", "demos.json is damaged"),
+        ("return", "demos.json is damaged"),
+        ("size", "demos.json is damaged"),
         ("format", "has format 9, and this version reads format 1"),
         ("folder outside", "demos/secret.npz cannot be read"),
         ("empty", "holds no episode"),
@@ -167,6 +174,25 @@ def test_damage_is_named_in_one_line(demos: Demonstrations, how: str, message: s
     with pytest.raises(MerlError, match=message) as caught:
         Demonstrations.open(demos.path).load(CONFIG, OBSERVATION, ACTION)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["00001.npz", "demos.json"])
+def test_any_damaged_byte_is_harmless_or_named_in_one_line(
+    demos: Demonstrations, name: str
+) -> None:
+    file, dice, told = demos.path / name, random.Random(name), list[str]()
+    right = file.read_bytes()
+    for _ in range(100):
+        data = bytearray(right)
+        for _ in range(dice.choice([1, 8])):
+            data[dice.randrange(len(data))] = dice.choice([0, 255, dice.randrange(256)])
+        file.write_bytes(data)
+        try:
+            list(Demonstrations.open(demos.path).episodes())
+        except MerlError as error:
+            told.append(str(error))
+    assert len(told) > 50
+    assert not any("\n" in each for each in told)
 
 
 def test_folders_that_are_not_demonstrations(tmp_path: Path, demos: Demonstrations) -> None:

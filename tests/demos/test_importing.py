@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -199,6 +200,11 @@ def _info(path: Path, **changes: Any) -> None:
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
 
 
+def _pipe(file: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)
+
+
 def _table(path: Path, change: Callable[[Any], Any]) -> None:
     (file,) = path.glob("data/*/*.parquet")
     table = parquet.read_table(file)
@@ -221,6 +227,7 @@ def _table(path: Path, change: Callable[[Any], Any]) -> None:
             lambda p: next(p.glob("data/*/*")).write_bytes(b"PAR1 cut"),
             "file-000.parquet cannot be read",
         ),
+        (lambda p: _pipe(next(p.glob("data/*/*"))), "it is a pipe, not a file"),
         (lambda p: _table(p, lambda t: t.slice(0, 9)), "and its index says 5"),
         (lambda p: _table(p, lambda t: t.drop(["action"])), "lacks column 'action'"),
     ],

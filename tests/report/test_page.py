@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -125,6 +126,7 @@ def test_the_same_runs_give_the_same_figures(report: Path, tmp_path: Path) -> No
 def test_videos_beyond_the_limit_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = write_run(tmp_path / "a-s0", [1, 2, 3], [0, 0, 0])
     write_video(run / "videos/00003000.mp4")
+    os.truncate(run / "videos/00003000.mp4", 1 << 40)  # is not read
     monkeypatch.setattr("merl.report.page.MOST_VIDEO", 10)
     page = write_report(*collect([run]), tmp_path / "out").read_text()
     assert "<video" not in page

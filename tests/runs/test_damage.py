@@ -6,10 +6,8 @@ import logging
 import os
 import random
 import shutil
-import signal
 import stat
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,7 @@ import pytest
 from safetensors.torch import load_file
 from test_recovery import EPISODE, assert_same, line, saved, started, wait_until_saved
 
+from disguises import DISGUISES, at_most
 from merl.cli import main
 from merl.runs.checkpoint import Checkpoint
 
@@ -177,58 +176,6 @@ def test_a_damaged_last_checkpoint_costs_nothing_but_its_steps(
     assert f"resumes at step {last - EPISODE}" in out
     assert_same(whole, parts)
     assert all(Checkpoint.open(path) for path in (parts / "checkpoints").iterdir())
-
-
-def fifo(path: Path) -> None:
-    os.mkfifo(path)
-
-
-def device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def folder(path: Path) -> None:
-    path.mkdir()
-
-
-def loop(path: Path) -> None:
-    path.symlink_to(path)
-
-
-def sparse(path: Path) -> None:
-    path.touch()
-    os.truncate(path, 1 << 40)
-
-
-def deep(path: Path) -> None:
-    path.write_text("[" * 1_000_000)
-
-
-def absurd(path: Path) -> None:
-    path.write_text('{"format": 1e999, "step": ' + "9" * 4000 + ', "files": {}, "score": 1e999}')
-
-
-def binary(path: Path) -> None:
-    path.write_bytes(bytes(range(128, 256)) * 10)
-
-
-DISGUISES = [fifo, device, folder, loop, sparse, deep, absurd, binary]
-
-
-@contextmanager
-def at_most(seconds: int) -> Iterator[None]:
-    """Fail if the block hangs."""
-
-    def fail(*_: object) -> None:
-        raise AssertionError("a command hangs")
-
-    former = signal.signal(signal.SIGALRM, fail)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, former)
 
 
 @pytest.mark.parametrize("disguise", DISGUISES, ids=lambda each: each.__name__)

@@ -10,9 +10,7 @@ The observations are stored as the environment returned them, without loss.
 from __future__ import annotations
 
 import hashlib
-import json
-import zipfile
-import zlib
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +20,8 @@ import numpy as np
 from gymnasium import spaces
 
 from merl.core import MerlError, Transition, counted
+from merl.core.files import cause, open_file, read_json, reporting
+from merl.core.user_code import in_one_line
 from merl.demos.episode import Episode, check_episode
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.replay.mixing import INTENDED
@@ -73,7 +73,7 @@ class Demonstrations:
         """
         file = path / INDEX
         try:
-            found = json.loads(file.read_text())
+            found = read_json(file)
             if found["format"] != FORMAT:
                 raise MerlError(
                     f"{file} has format {found['format']}, and this version reads format {FORMAT}"
@@ -101,9 +101,11 @@ class Demonstrations:
                 "--resume and their new --demos)"
             ) from None
         except OSError as error:
-            raise MerlError(f"{file} cannot be read: {error.strerror}") from None
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise MerlError(f"{file} is damaged: {error!r}") from None
+            raise MerlError(f"{file} cannot be read: {cause(error)}") from None
+        except MerlError:
+            raise
+        except Exception as error:  # the file may come from anyone
+            raise MerlError(f"{file} is damaged: {in_one_line(error)}") from None
 
     @property
     def steps(self) -> int:
@@ -122,16 +124,15 @@ class Demonstrations:
     def _read(self, line: Line) -> Episode:
         file = self.path / Path(line.file).name
         try:
-            with np.load(file, allow_pickle=False) as arrays:
+            with open_file(file) as opened, np.load(opened, allow_pickle=False) as arrays:
                 found = {name: arrays[name] for name in arrays.files}
             observations = {key: found[KEY + key] for key in self.observation_space}
             actions, intended, rewards = found["action"], found["intended"], found["reward"]
             terminated, successes = bool(found["terminated"]), found.get("success")
-        except (
-            *(OSError, ValueError, KeyError, EOFError, TypeError, AttributeError),
-            *(zipfile.BadZipFile, zlib.error),
-        ) as error:
-            raise MerlError(f"{file} cannot be read: {error}: record it again") from None
+        except Exception as error:  # of a damaged archive: of many types
+            raise MerlError(
+                f"{file} cannot be read: {in_one_line(error)}: record it again"
+            ) from None
         episode = Episode(
             observations, actions, intended, rewards, terminated, line.success, successes
         )
@@ -142,12 +143,14 @@ class Demonstrations:
 
     def digest(self) -> str:
         """Return the SHA-256 of the index and of all episodes."""
-        digest = hashlib.sha256((self.path / INDEX).read_bytes())
-        for line in self.lines:
-            try:
-                digest.update((self.path / Path(line.file).name).read_bytes())
-            except OSError as error:
-                raise MerlError(f"{self.path / line.file} cannot be read: {error}") from None
+        digest = hashlib.sha256()
+        for name in (INDEX, *(Path(line.file).name for line in self.lines)):
+            with (
+                reporting(f"{self.path / name} cannot be read"),
+                open_file(self.path / name) as file,
+            ):
+                while part := file.read(1 << 20):
+                    digest.update(part)
         return digest.hexdigest()
 
     def check_fits(self, observation_space: spaces.Dict, action_space: spaces.Box) -> None:
@@ -229,11 +232,14 @@ def _line(values: Any) -> Line:
 
     Raises:
         TypeError: a value has another type.
+        ValueError: the return is not finite.
     """
     line = Line(**values)
     types = (line.file, str), (line.steps, int), (line.returned, int | float)
     if not all(isinstance(value, kind) for value, kind in types) or line.steps < 1:
         raise TypeError(f"the line {values}")
+    if not math.isfinite(line.returned):
+        raise ValueError(f"the line {values}")
     if not (line.success is None or isinstance(line.success, bool)):
         raise TypeError(f"the line {values}")
     return line

@@ -8,7 +8,6 @@ videos/KEY/chunk-*/file-*.mp4         frames of one camera; a file holds several
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merl.core import MerlError
+from merl.core.files import check_kind, read_json, reporting
 from merl.demos.lerobot_frames import VideoFrames, decoded
 from merl.demos.packages import require
 from merl.demos.source import Feature, RawEpisode
@@ -132,6 +132,8 @@ class LeRobotDataset:
             raise MerlError(f"{self.path}: the index of {name} is damaged: {error!r}") from None
         if not found.resolve().is_relative_to(self.path.resolve()):
             raise MerlError(f"{self.path / INFO} names {found}, which is outside of the folder")
+        with reporting(f"{found} cannot be read"):
+            check_kind(found)
         return found
 
     def _values(self, table: Any, key: str, file: Path) -> NDArray[Any]:
@@ -171,10 +173,10 @@ class LeRobotDataset:
 def _info(path: Path) -> dict[str, Any]:
     file = path / INFO
     try:
-        info = json.loads(file.read_text())
+        info = read_json(file)
     except FileNotFoundError:
         raise MerlError(f"{path} is no LeRobotDataset v3: it has no {INFO}") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise MerlError(f"{file} cannot be read: {error}") from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not isinstance(version, str) or not version.startswith(VERSION):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import logging
 import runpy
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.core import MerlError, Observation
+from merl.core.files import read_json
 from merl.core.user_code import in_one_line
 from merl.evaluation.policy import checked
 from merl.modalities import modalities_of
@@ -112,10 +113,10 @@ def card_of(path: Path) -> Path:
 def _card(path: Path) -> dict[str, Any]:
     file = card_of(path)
     try:
-        card = json.loads(file.read_text())
+        card = read_json(file)
     except FileNotFoundError:
         raise MerlError(f"{path} has no card {file.name} beside it: copy both files") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise MerlError(f"{file} cannot be read: {error}") from None
     if not path.is_file():
         raise MerlError(f"{path} does not exist")
@@ -145,6 +146,7 @@ def load_exported(path: Path, names: list[str], outputs: list[str]) -> Run:
         return lambda values: dict(found["compute"](weights, values))
     import torch
 
+    logging.getLogger("torch.export").setLevel(logging.ERROR)  # its warnings are tracebacks
     module = torch.export.load(path).module()
 
     def run(values: Values) -> dict[str, NDArray[Any]]:

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from merl.core import MerlError, check_choice
+from merl.core.files import cause, read_file
 from merl.experiments.experiment import Experiment, Variant, variants_of
 
 KEYS = ("title", "tasks", "preset", "values", "variants", "grid")
@@ -38,9 +39,9 @@ def read_experiment(path: Path) -> Experiment:
         MerlError: the file cannot be read, or a part of it is missing, unknown or of another kind.
     """
     try:
-        content = tomllib.loads(path.read_text())
+        content = tomllib.loads(read_file(path).decode())
     except OSError as error:
-        raise MerlError(f"{path} cannot be read: {error.strerror}") from None
+        raise MerlError(f"{path} cannot be read: {cause(error)}") from None
     except ValueError as error:  # also text that is not UTF-8
         raise MerlError(f"{path} is not TOML: {error}") from None
     for key, value in content.items():

@@ -113,7 +113,7 @@ class SeedRun:
     def videos(self) -> dict[int, Path]:
         """The videos of evaluations, by step."""
         found = sorted((self.path / "videos").glob("*.mp4")) if self.path.is_dir() else []
-        return {int(path.stem): path for path in found if path.stem.isdigit()}
+        return {int(path.stem): path for path in found if path.stem.isdigit() and path.is_file()}
 
     def curve(self, name: str, x: str = "step") -> Curve:
         """Return a column of the evaluations, e.g. `return`, over another."""

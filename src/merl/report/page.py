@@ -299,11 +299,12 @@ class _Budget:
             return ""
         step, path = [*run.videos.items()][-1]
         try:
-            content = path.read_bytes()
+            fits = path.stat().st_size <= self._left
+            content = path.read_bytes() if fits else b""
         except OSError as error:
             self.notes.append(f"{path} cannot be read: {error.strerror}")
             return ""
-        if len(content) > self._left:
+        if not fits:
             self.notes.append(f"{run.name}: its video is left out, to keep the page small: {path}")
             return ""
         self._left -= len(content)

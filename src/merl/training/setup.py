@@ -254,13 +254,13 @@ def load_demos(
                 f"{found.path} was recorded with --{name} {found.options[name]}, and the run has "
                 f"{value}: their rewards do not mix"
             )
+    loaded = found.load(config.replay, space, action_space)  # what is no episode is not hashed
     digest = found.digest()
     if config.demos_hash not in (None, digest):
         raise MerlError(
             f"{found.path} holds other demonstrations than those with which the run began: restore "
             "them, or name their folder with --demos"
         )
-    loaded = found.load(config.replay, space, action_space)
     return loaded, dataclasses.replace(config, demos=found.path, demos_hash=digest)
 
 

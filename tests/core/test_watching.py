@@ -184,6 +184,15 @@ with watching.ending({code}, "close() hangs"):
         assert process.stderr.read() == "close() hangs\n"
 
 
+def test_an_end_that_crashes_is_one_line() -> None:
+    program = "print('ready')\nwith watching.ending(0, 'it hangs'): ctypes.string_at(0)"
+    with running(program) as process:
+        _, err = process.communicate(timeout=20)
+    assert process.returncode == -signal.SIGSEGV
+    (line,) = err.splitlines()
+    assert "C code crashed (Segmentation fault)" in line
+
+
 @pytest.mark.long
 def test_an_end_that_hangs_takes_at_most_ten_seconds() -> None:
     begin = time.monotonic()

@@ -107,15 +107,16 @@ def ending(code: int, text: str) -> Iterator[None]:
     """End this process with an exit code if the block takes `END_SECONDS`, and print a line then.
 
     The block may hang in C code: another process prints, and a thread of the C library ends this
-    one.
+    one. It may crash there, too: see `merl.core.watcher.watch`.
     """
-    process, timer = _start_ending(code, text)
-    try:
-        yield
-    finally:
-        if timer is not None:
-            _timers().timer_delete(timer)
-        _stop(process)
+    with _crashes() as crash:
+        process, timer = _start_ending(code, text, crash)
+        try:
+            yield
+        finally:
+            if timer is not None:
+                _timers().timer_delete(timer)
+            _stop(process)
 
 
 def end_soon(code: int) -> None:
@@ -129,15 +130,18 @@ def end_soon(code: int) -> None:
     what = (
         f"thread {names}, which did not end" if names else "an exit handler, which did not return"
     )
-    _start_ending(code, f"merl: warning: ended without waiting for {what} within {END_SECONDS:g} s")
+    text = f"merl: warning: ended without waiting for {what} within {END_SECONDS:g} s"
+    null = os.open(os.devnull, os.O_RDONLY)
+    _start_ending(code, text, null)
+    os.close(null)
 
 
-def _start_ending(code: int, text: str) -> tuple[subprocess.Popen[bytes] | None, Any]:
+def _start_ending(code: int, text: str, crash: int) -> tuple[subprocess.Popen[bytes] | None, Any]:
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, OSError, ValueError):  # None, or closed
             stream.flush()
     null = os.open(os.devnull, os.O_RDONLY)
-    process = _start_watcher(null, null, END_SECONDS, text, waits=True)
+    process = _start_watcher(null, crash, END_SECONDS, text, waits=True)
     os.close(null)
     return process, _exit_after(END_SECONDS + _LAST, code)
 

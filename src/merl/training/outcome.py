@@ -49,9 +49,9 @@ class Outcome:
         try:
             last = f"step {Checkpoint.find(self.run.checkpoints).step:,}"
         except MerlError:
-            last = "its start"
+            last = "its last checkpoint, or its start"
         raise NotSaved(
             f"{self.run.path} ended at step {self.progress.step:,}, but {' and '.join(lost)} could "
-            f"not be written: make room on the disk, then `{resume_line(self.run.path)}` continues "
-            f"from {last}"
+            f"not be written: once the disk can be written, `{resume_line(self.run.path)}` "
+            f"continues from {last}"
         )

@@ -23,13 +23,28 @@ MOST = {"state": 100_000, "laptop": 100_000}
 BOXES = ("move_box", "lift_box")
 COMPARED = {"state": ("ddpg", "sac", "merl_state"), "laptop": ("merl", "drqv2", "proprio")}
 
+PAPER = {
+    "fig2": {
+        "MERL, preset laptop": ("fig2", "merl-laptop"),
+        "DrQ-v2, preset laptop": ("fig2", "drqv2-laptop"),
+        "DDPG, preset state": ("fig2", "ddpg-state"),
+        "SAC, preset state": ("fig2", "sac-state"),
+    },
+    "fig3": {
+        "MERL": ("fig2", "merl-laptop"),
+        "fusion shared by actor and critic (3a)": ("fig3", "shared-laptop"),
+        "no LayerNorm in the fusion (3c)": ("fig3", "no_norm-laptop"),
+    },
+}
+"""{figure: {label: folder in results/ and the runs' names}}."""
+
 
 def main() -> None:
     """Draw all figures; print the table of the evaluations."""
     laptop()
     gpu()
     agents()
-    figure_2()
+    paper()
     small_tasks()
     boxes()
     for file in sorted(AGENTS.glob("*-evaluation.json")):
@@ -99,24 +114,19 @@ def agents() -> None:
         )
 
 
-def figure_2() -> None:
-    """Draw the runs of `merl sweep fig2`."""
-    learning_curves(
-        {
-            f"{label}, preset {preset}": sorted(
-                (DATA / "fig2").glob(f"reach_duplo-{agent}-{preset}-s?.csv")
-            )
-            for label, agent, preset in (
-                ("MERL", "merl", "laptop"),
-                ("DrQ-v2", "drqv2", "laptop"),
-                ("DDPG", "ddpg", "state"),
-                ("SAC", "sac", "state"),
-            )
-        },
-        IMAGES / "fig2.png",
-        references={row.name: row.returns.mean for row in references("reach_duplo")},
-        title="reach_duplo",
-    )
+def paper() -> None:
+    """Draw the runs of the sweeps of the paper's figures."""
+    lines = {row.name: row.returns.mean for row in references("reach_duplo")}
+    for name, runs in PAPER.items():
+        learning_curves(
+            {
+                label: sorted(DATA.glob(f"{folder}/reach_duplo-{rest}-s?.csv"))
+                for label, (folder, rest) in runs.items()
+            },
+            IMAGES / f"{name}.png",
+            references=lines,
+            title="reach_duplo",
+        )
 
 
 def seeds(task: str, agent: str, preset: str) -> list[Curve]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import random
@@ -16,6 +17,7 @@ from safetensors.torch import load_file
 from test_recovery import EPISODE, assert_same, line, saved, started, wait_until_saved
 
 from disguises import DISGUISES, at_most
+from faults import Faults, with_faults
 from merl.cli import main
 from merl.runs.checkpoint import Checkpoint
 
@@ -210,6 +212,21 @@ def test_a_name_that_is_not_text_does_not_matter(
     with caplog.at_level(logging.WARNING):
         assert main(["check", str(copy)]) == 0
         assert resume(copy) == 0
+
+
+def test_check_does_not_call_a_file_damaged_that_cannot_be_read(
+    finished: Path, tmp_path: Path
+) -> None:
+    copy = copy_of(finished, tmp_path)
+    check = lambda: main(["check", str(copy)])  # noqa: E731
+    whole = with_faults(check, Faults(copy))
+    assert whole.code == 0
+    assert len(whole.names) > 20
+    for at, name in enumerate(whole.names, 1):
+        ended = with_faults(check, Faults(copy, at, errno.EIO, lasts=at % 2 == 0))
+        assert "DAMAGED" not in ended.out, (name, ended.out)
+        assert ended.code == 2, (name, ended.out, ended.err)
+        assert one_line(ended.err), (name, ended.err)
 
 
 def test_check_changes_nothing_and_refuses_a_run_in_training(

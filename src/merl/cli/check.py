@@ -11,7 +11,7 @@ import tyro
 
 from merl.cli.parsing import parse
 from merl.core import CONFIG_FILE, MerlError
-from merl.runs.checking import check_run
+from merl.runs.checking import check_run, damage_of
 from merl.runs.run import Run
 
 
@@ -31,7 +31,7 @@ def check(args: list[str]) -> int:
     except MerlError as error:
         if not os.path.lexists(options.run / CONFIG_FILE):
             raise
-        print(f"DAMAGED: {error}; without it nothing else can be checked")
+        print(f"DAMAGED: {damage_of(error).text}; without it nothing else can be checked")
         return 1
     sound = True
     for finding in check_run(run):

@@ -234,7 +234,10 @@ class ReplayBuffer:
             )
         ]
         if damage and not len(self):
-            raise MerlError(f"the replay in {self._directory} holds no step without damage")
+            raise MerlError(
+                f"the replay in {self._directory} holds no step without damage: restore the file "
+                "from a copy, or start a new run from this one's policy (--agent.start-from RUN)"
+            )
         if all(exact):
             for key, frames in state["starts"].items():
                 self._compressed[key].backgrounds.truncate(int(frames))

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from merl.core import LOCK_FILE, METRICS_FILE, MerlError, counted
-from merl.core.files import cause, open_file, reporting
+from merl.core.files import cause, is_damage, open_file, reporting
 from merl.replay import ReplaySpec
 from merl.replay.damage import find_damage
-from merl.runs.checkpoint import Checkpoint, readable
+from merl.runs.checkpoint import Checkpoint, Unreadable, readable
 from merl.runs.checkpoint_folders import folders
 from merl.runs.metrics import read_rows
 from merl.runs.run import Run
@@ -29,7 +29,8 @@ def check_run(run: Run) -> Iterator[Finding]:
     """Yield what is sound and what is damaged in a run whose `config.json` has been read.
 
     Raises:
-        MerlError: a process trains in the folder, so that its files change.
+        MerlError: a process trains in the folder, so that its files change, or the disk does not
+            let a file be read.
     """
     with _not_in_use(run.path):
         yield Finding(True, f"{run.path}/config.json is sound")
@@ -41,12 +42,12 @@ def check_run(run: Run) -> Iterator[Finding]:
                 last = Checkpoint.open(path)
                 yield Finding(True, f"{path} is sound")
             except MerlError as error:
-                yield Finding(False, str(error))
+                yield damage_of(error)
         try:
             rows = counted(len(read_rows(run.path / METRICS_FILE)[1]), "row")
             yield Finding(True, f"{run.path / METRICS_FILE} can be read: {rows}")
         except MerlError as error:
-            yield Finding(False, str(error))
+            yield damage_of(error)
         if last is not None:
             yield from _check_replay(run, last)
 
@@ -65,13 +66,22 @@ def _check_replay(run: Run, start: Checkpoint) -> Iterator[Finding]:
             state = start.state()["replay"]
             damage = find_damage(run.replay, spec, state)
     except MerlError as error:
-        yield Finding(False, str(error))
+        yield damage_of(error)
         return
     yield from (Finding(False, str(each)) for each in damage)
     if not damage:
         known = "is sound" if "covered" in state else "can be read; it has no checksums"
-        steps = counted(sum(int(ring["steps"]) for ring in state["rings"]), "step")
+        held = (min(int(ring["steps"]), spec.ring_capacity) for ring in state["rings"])
+        steps = counted(sum(held), "step")
         yield Finding(True, f"{run.replay} {known}: {steps} of checkpoint {start.path.name}")
+
+
+def damage_of(error: MerlError) -> Finding:
+    """Return what an error says if it is damage; else raise it: the disk may work again."""
+    of_disk = error.__cause__
+    if isinstance(error, Unreadable) or (isinstance(of_disk, OSError) and not is_damage(of_disk)):
+        raise error
+    return Finding(False, str(error))
 
 
 @contextmanager

@@ -268,7 +268,7 @@ def readable(checkpoint: Checkpoint) -> Iterator[None]:
         *_BAD_VALUES,
     ) as error:
         why = " ".join(line.strip() for line in str(error).strip().split("\n")[:2])
-        raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {why}") from None
+        raise MerlError(f"checkpoint {checkpoint.path} cannot be loaded: {why}") from error
 
 
 def _learner(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +23,11 @@ SPACE = spaces.Dict(
     }
 )
 CONFIG = IBRLConfig(
-    frozen_encoders=("image", "proprio"), hidden_dim=32, latent_dim=16, conv_channels=4
+    start_from=Path("cloned"),
+    frozen_encoders=("image", "proprio"),
+    hidden_dim=32,
+    latent_dim=16,
+    conv_channels=4,
 )
 SIZE = 64
 
@@ -119,6 +124,7 @@ def test_the_own_action_is_taken_if_both_are_equal() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
+        ({"start_from": None}, "clone with --demos DIR --demos-pretrain UPDATES, or name"),
         ({"frozen_encoders": ()}, "clone with --demos DIR --demos-pretrain UPDATES, or name"),
         ({"privileged": ("proprio",)}, r"must not need agent.privileged \('proprio',\): remove"),
     ],

@@ -30,13 +30,14 @@ class IBRL(DDPG):
     """DDPG with a cloned policy beside the actor; the arguments are those of `DDPG`.
 
     Raises:
-        MerlError: an encoder is trained, or the critic has privileged keys, which are unknown when
-            a deployed policy acts.
+        MerlError: the run starts with no policy, an encoder is trained, or the critic has
+            privileged keys, which are unknown when a deployed policy acts.
     """
 
     def __init__(self, config: IBRLConfig, *spaces: Any, **options: Any) -> None:
         super().__init__(config, *spaces, **options)
-        if any(weight.requires_grad for weight in self.networks.encoders.parameters()):
+        trained = any(weight.requires_grad for weight in self.networks.encoders.parameters())
+        if trained or config.start_from is None:
             raise MerlError(
                 "agent ibrl needs a cloned policy and its encoders as they are: clone with --demos "
                 "DIR --demos-pretrain UPDATES, or name a run and all keys with encoders with "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -52,6 +53,15 @@ def test_an_actor_acts_as_the_learner(name: str, changes: dict[str, Any]) -> Non
     assert torch.equal(*actions)
     assert all(torch.equal(own[k], v) for k, v in actor.networks.critic.state_dict().items())
     assert len(data) < sum(4 * p.numel() for p in learner.networks.parameters())
+
+
+def test_an_actor_that_chooses_by_the_critic_has_the_critic() -> None:
+    changes = {"start_from": Path("cloned"), "frozen_encoders": ("image", "joint")}
+    learner, actor = agent("ibrl", 0, **changes), agent("ibrl", 1, **changes)
+    form, data = weights.pack(learner)
+    weights.load(actor, form, bytearray(data))
+    theirs = actor.networks.state_dict()
+    assert all(v.equal(theirs[k]) for k, v in learner.networks.state_dict().items())
 
 
 def test_weights_of_other_networks_are_refused() -> None:

@@ -1,8 +1,9 @@
 """Random generators that an environment may use in addition to Gymnasium's `np_random`.
 
-The global generators of NumPy, Python and torch belong to the whole process. They are seeded with
-the seed of an episode if it has one, and they are saved in checkpoints. An evaluation restores them
-at its end, together with the generators of its environment.
+The global generators of NumPy, Python and torch (if something has imported it, which takes seconds)
+belong to the whole process. They are seeded with the seed of an episode if it has one, and they are
+saved in checkpoints. An evaluation restores them at its end, together with the generators of its
+environment.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def set_global_state(state: Mapping[str, Any]) -> None:
 
 
 def _torch() -> Any:
-    """Return torch if something has imported it, else None: importing it takes seconds."""
+    """Return torch if something has imported it, else None."""
     return sys.modules.get("torch")
 
 

@@ -89,7 +89,7 @@ def watched(log: int, patience: float, text: str) -> Iterator[None]:
 def _crashes() -> Iterator[int]:
     """Yield the descriptor of a file in memory to which Python writes if C code crashes.
 
-    It stays empty if `faulthandler` was enabled before; then Python writes where it was told to.
+    It stays empty if `faulthandler` is already enabled: then Python writes to another file.
     """
     file, ours = new_log(), not faulthandler.is_enabled()
     if ours:
@@ -130,18 +130,17 @@ def end_soon(code: int) -> None:
     what = (
         f"thread {names}, which did not end" if names else "an exit handler, which did not return"
     )
-    text = f"merl: warning: ended without waiting for {what} within {END_SECONDS:g} s"
-    null = os.open(os.devnull, os.O_RDONLY)
-    _start_ending(code, text, null)
-    os.close(null)
+    _start_ending(code, f"merl: warning: ended without waiting for {what} within {END_SECONDS:g} s")
 
 
-def _start_ending(code: int, text: str, crash: int) -> tuple[subprocess.Popen[bytes] | None, Any]:
+def _start_ending(
+    code: int, text: str, crash: int | None = None
+) -> tuple[subprocess.Popen[bytes] | None, Any]:
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, OSError, ValueError):  # None, or closed
             stream.flush()
     null = os.open(os.devnull, os.O_RDONLY)
-    process = _start_watcher(null, crash, END_SECONDS, text, waits=True)
+    process = _start_watcher(null, null if crash is None else crash, END_SECONDS, text, waits=True)
     os.close(null)
     return process, _exit_after(END_SECONDS + _LAST, code)
 

@@ -254,7 +254,7 @@ def load_demos(
                 f"{found.path} was recorded with --{name} {found.options[name]}, and the run has "
                 f"{value}: their rewards do not mix"
             )
-    loaded = found.load(config.replay, space, action_space)  # what is no episode is not hashed
+    loaded = found.load(config.replay, space, action_space)  # this checks the files
     digest = found.digest()
     if config.demos_hash not in (None, digest):
         raise MerlError(

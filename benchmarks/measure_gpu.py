@@ -40,12 +40,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from measure_gains import Change, channels_first
 from merl.accelerate.cuda_graph import Recorded, UpdateOnDevice
 from merl.accelerate.device_replay import DeviceReplay
-from merl.accelerate.twins import join_heads
+from merl.accelerate.joint_heads import join_heads
 from merl.agents.ddpg import DDPG
 from merl.bench import train, update
 from merl.bench.measuring import circumstances, spread
 from merl.core import MerlError
-from merl.networks.critic import TwinCritic
+from merl.networks.critic import Critic
 from merl.training.setup import choose_device
 
 
@@ -210,10 +210,10 @@ def gains(agent: str, batch_size: int, updates: int, repeats: int) -> dict[str, 
     return {"updates_per_s": found, "batch_size": batch_size, "agent": agent} | circumstances()
 
 
-def critics(learner: DDPG) -> Iterator[TwinCritic]:
+def critics(learner: DDPG) -> Iterator[Critic]:
     """Yield the critic and its target."""
     for critic in (learner.networks.critic, learner.critic_target["critic"]):
-        assert isinstance(critic, TwinCritic)
+        assert isinstance(critic, Critic)
         yield critic
 
 
@@ -222,7 +222,7 @@ def one_by_one(learner: DDPG) -> Iterator[None]:
     """Let the critics compute their heads one by one."""
     with ExitStack() as stack:
         for critic in critics(learner):
-            forward = partial(TwinCritic.forward, critic)
+            forward = partial(Critic.forward, critic)
             stack.enter_context(patch.object(critic, "forward", forward))
         yield
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import tyro
 
 from merl.agents import AGENTS
-from merl.agents.config import ObservationConfig
+from merl.agents.config import ObservationConfig, decayed
 from merl.core import MerlError, check_choice, counted, suggest
 from merl.core.choices import HandStart
 from merl.core.fields import NOT_EMPTY, Range, check_fields
@@ -144,7 +144,11 @@ class TrainConfig:
     demos: Path | None = None
     """Folder of demonstrations (`merl demos`), from which a part of each batch is drawn."""
     demos_ratio: Annotated[float, Range(0, 1, without=0)] = 0.5
-    """Share of the demonstrations in each batch, in (0, 1]."""
+    """Share of the demonstrations in each batch, in (0, 1]; at least one sample is of them."""
+    demos_ratio_end: Annotated[float, Range(0, 1)] | None = None
+    """Final share, reached linearly over `demos_ratio_steps`; if not set, it is constant."""
+    demos_ratio_steps: Annotated[int, Range(1, 10**12)] = 500_000
+    """Environment steps over which the share changes."""
     demos_pretrain: NotNegative = 0
     """Updates of agent `bc` from the demonstrations before the run, in a run of its own, RUN-bc,
     whose policy the agent starts with (`agent.start-from`)."""
@@ -192,6 +196,10 @@ class TrainConfig:
                 f"{counted(self.capacity, 'step')} that the replay will hold: use a smaller batch "
                 "or more steps"
             )
+
+    def demos_share(self, step: int) -> float:
+        """Return the share of the demonstrations in a batch after `step` environment steps."""
+        return decayed(self.demos_ratio, self.demos_ratio_end, step / self.demos_ratio_steps)
 
     @property
     def has_user_env(self) -> bool:

@@ -74,7 +74,8 @@ class Case:
             clip=c.noise_clip,
             tau=c.tau,
             learning_rate=c.step_size(self.step),
-            averaged=(*fusion, "phi_1", "phi_2"),
+            averaged=(*fusion, *(f"phi_{k + 1}" for k in range(c.critics))),
+            critics=c.critics,
             bins=c.critic_bins if c.critic_loss == "hl_gauss" else 0,
             low=c.critic_low,
             high=100.0 if c.critic_high is None else c.critic_high,
@@ -142,7 +143,10 @@ class Case:
         def noise() -> Tensor:
             return torch.randn(self.batch, ACTIONS, generator=generator).to(dtype)
 
-        return reference.Chance(shifts(), shifts(), noise(), noise())
+        pair = (1, 2)
+        if self.config.critics > 2:
+            pair = (1 + seed % self.config.critics, 1 + (seed + 2) % self.config.critics)
+        return reference.Chance(shifts(), shifts(), noise(), noise(), pair)
 
 
 def named_cases(*cases: Case) -> pytest.MarkDecorator:
@@ -211,7 +215,7 @@ _NAMES = [
     (r"(critic|actor)_fusion\.projections\.(\w+)\.", r"psi_\1.\2."),
     (r"(critic|actor)_fusion\.norms\.(\w+)\.", r"psi_\1.\2.norm."),
     (r"(critic|actor)_fusion\.attention\.", r"psi_\1.attention."),
-    (r"critic\.q([12])\.(\d+)\.(linear\.)?", lambda m: f"phi_{m[1]}.{int(m[2]) + 1}."),
+    (r"critic\.q(\d+)\.(\d+)\.(linear\.)?", lambda m: f"phi_{m[1]}.{int(m[2]) + 1}."),
     (r"actor\.layers\.(\d+)\.(linear\.)?", lambda m: f"theta.{int(m[1]) + 1}."),
     (r"norm\.weight", "norm.scale"),
     (r"norm\.bias", "norm.shift"),
@@ -255,7 +259,7 @@ def state_of(agent: DDPG) -> reference.State:
     """Return the agent's state as the reference's, before or after its first update."""
     weights = weights_of(agent)
     if not agent.critic_optimizer.state:
-        return reference.start(weights, reference.Spec())
+        return reference.start(weights, reference.Spec(critics=agent.config.critics))
     critic, actor = (
         moments_of(optimizer, agent)
         for optimizer in (agent.critic_optimizer, agent.actor_optimizer)
@@ -290,7 +294,13 @@ def draws_of(
         next_shifts=chance.shift_next,
         next_noise=clipped(chance.noise_next),
         actor_noise=clipped(chance.noise),
+        pair=pair_of(chance, config),
     )
+
+
+def pair_of(chance: reference.Chance, config: AgentConfig) -> Tensor | None:
+    """Return the indices of the target's two Qs, as the package counts them."""
+    return torch.tensor(chance.pair) - 1 if config.critics > 2 else None
 
 
 # -- differences ---------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ function from a state to the next. docs/explanation/paper.md lists what the pape
     psi_critic.KEY  multimodal fusion h for the critic, one modality
     psi_actor.KEY   multimodal fusion h for the actor, one modality
     theta           actor pi
-    phi_1, phi_2    critic Q
+    phi_1, phi_2    critic Q; phi_3, ... in an ensemble
     bar_NAME        the exponential moving average of NAME
 
 The gradients come from autograd; the forward computation and Adam are written out.
@@ -49,10 +49,15 @@ class Spec:
     clip: float = 0.3
     tau: float = 0.01
     learning_rate: float = 1e-4
+    critics: int = 2  # Q-functions
     bins: int = 0  # bins of the critic's histogram (HL-Gauss); 0: squared error
     low: float = 0.0  # bounds of the targets
     high: float = 100.0
     averaged: tuple[str, ...] = ("phi_1", "phi_2")  # with "psi_critic" in front: DrQ-v2's target
+
+    @property
+    def phis(self) -> list[str]:
+        return [f"phi_{k}" for k in range(1, self.critics + 1)]
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,7 @@ class Chance:
     shift_next: dict[str, Tensor]  # the same for o_{t+n}
     noise: Tensor  # (B, A) standard normal, for a_t in the actor's loss
     noise_next: Tensor  # (B, A) standard normal, for a_{t+n} in the target
+    pair: tuple[int, int] = (1, 2)  # the two Qs of the target
 
 
 @dataclass(frozen=True)
@@ -302,20 +308,28 @@ def target(w: Weights, sample: Sample, chance: Chance, spec: Spec) -> Tensor:
     r_next = encode(w, sample.o_next, chance.shift_next, spec)
     a_next = pi(w, h(w, "psi_actor", r_next, spec), chance.noise_next, spec)
     r_mm_next = h(w, psi, r_next, spec)
-    q_next = torch.minimum(
-        q(w, "bar_phi_1", r_mm_next, a_next, spec), q(w, "bar_phi_2", r_mm_next, a_next, spec)
-    )
-    return sample.r + sample.discount * q_next
+    return sample.r + sample.discount * q_target(w, r_mm_next, a_next, chance, spec)
+
+
+def q_target(w: Weights, r_mm: Tensor, a: Tensor, chance: Chance, spec: Spec) -> Tensor:
+    """The smaller of two averages: clipped double Q, in an ensemble of a random pair (REDQ)."""
+    return torch.minimum(*(q(w, f"bar_phi_{k}", r_mm, a, spec) for k in chance.pair))
+
+
+def q_actor(w: Weights, r_mm: Tensor, a: Tensor, spec: Spec) -> Tensor:
+    """The smaller of two, or the mean of an ensemble (REDQ, RLPD)."""
+    values = [q(w, phi, r_mm, a, spec) for phi in spec.phis]
+    return torch.minimum(*values) if len(values) == 2 else sum(values) / len(values)
 
 
 def critic_loss(w: Weights, r: Modalities, a: Tensor, y: Tensor, spec: Spec) -> Tensor:
     """Equation 1, the sum over k."""
     r_mm = h(w, "psi_critic", r, spec)
     if spec.bins:
-        logits = [output(w, phi, r_mm, a, spec) for phi in ("phi_1", "phi_2")]
+        logits = [output(w, phi, r_mm, a, spec) for phi in spec.phis]
         log_p = [x - x.exp().sum(-1, keepdim=True).log() for x in logits]
         return sum(-(histogram(y, spec) * each).sum(-1).mean() for each in log_p)
-    errors = [q(w, phi, r_mm, a, spec) - y for phi in ("phi_1", "phi_2")]
+    errors = [q(w, phi, r_mm, a, spec) - y for phi in spec.phis]
     return sum((error**2).mean() for error in errors)
 
 
@@ -323,13 +337,17 @@ def actor_loss(w: Weights, r: Modalities, noise: Tensor, spec: Spec) -> Tensor:
     """Equation 2; the critic's latent of o_t is constant, even if its fusion is trained here."""
     a = pi(w, h(w, "psi_actor", r, spec), noise, spec)
     r_mm = h(w, "psi_critic", r, spec).detach()
-    return -torch.minimum(q(w, "phi_1", r_mm, a, spec), q(w, "phi_2", r_mm, a, spec)).mean()
+    return -q_actor(w, r_mm, a, spec).mean()
 
 
 # -- algorithm 1 ---------------------------------------------------------------------------------
 
-CRITIC_LEARNS = ("xi", "zeta", "psi_critic", "phi_1", "phi_2")
 ACTOR_LEARNS = ("psi_actor", "theta")
+
+
+def critic_learns(spec: Spec) -> tuple[str, ...]:
+    """Return the symbols that the critic's loss trains."""
+    return ("xi", "zeta", "psi_critic", *spec.phis)
 
 
 def actor_learns(spec: Spec) -> tuple[str, ...]:
@@ -386,7 +404,7 @@ def update(state: State, sample: Sample, chance: Chance, spec: Spec) -> tuple[St
     def eq_1(w: Weights) -> Tensor:
         return critic_loss(w, encode(w, sample.o, chance.shift, spec), sample.a, y, spec)
 
-    loss_1, g_1 = eq_1(w), gradients(eq_1, w, of(w, CRITIC_LEARNS))
+    loss_1, g_1 = eq_1(w), gradients(eq_1, w, of(w, critic_learns(spec)))
     w, critic_adam = adam(w, state.critic_adam, g_1, spec)
 
     def eq_2(w: Weights) -> Tensor:
@@ -411,4 +429,4 @@ def start(weights: Weights, spec: Spec) -> State:
             {name: torch.zeros_like(weights[name]) for name in names},
         )
 
-    return State(dict(weights), zeros(CRITIC_LEARNS), zeros(actor_learns(spec)))
+    return State(dict(weights), zeros(critic_learns(spec)), zeros(actor_learns(spec)))

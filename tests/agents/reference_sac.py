@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from reference import (
-    CRITIC_LEARNS,
     Chance,
     Modalities,
     Moments,
@@ -23,13 +22,15 @@ from reference import (
     Weights,
     adam,
     average,
+    critic_learns,
     critic_loss,
     encode,
     gradients,
     h,
     mlp,
     of,
-    q,
+    q_actor,
+    q_target,
     tanh,
 )
 from torch import Tensor
@@ -79,24 +80,21 @@ def update(
     r_next = encode(w, sample.o_next, chance.shift_next, spec)
     a_next, log_pi_next = policy(w, r_next, chance.noise_next, spec)
     latent_next = h(w, "psi_critic", r_next, spec)
-    soft = torch.minimum(
-        q(w, "bar_phi_1", latent_next, a_next, spec), q(w, "bar_phi_2", latent_next, a_next, spec)
-    )
+    soft = q_target(w, latent_next, a_next, chance, spec)
     y = (sample.r + sample.discount * (soft - alpha * log_pi_next)).detach()
     features = encode(w, sample.o, chance.shift, spec)
 
     def eq_5(w: Weights) -> Tensor:
         return critic_loss(w, encode(w, sample.o, chance.shift, spec), sample.a, y, spec)
 
-    loss_1, g_1 = eq_5(w), gradients(eq_5, w, of(w, CRITIC_LEARNS))
+    loss_1, g_1 = eq_5(w), gradients(eq_5, w, of(w, critic_learns(spec)))
     w, critic_adam = adam(w, state.agent.critic_adam, g_1, spec)
     w = average(w, spec)
 
     def eq_9(w: Weights) -> Tensor:
         a, log_pi = policy(w, features, chance.noise, spec)
         latent = h(w, "psi_critic", features, spec).detach()
-        least = torch.minimum(q(w, "phi_1", latent, a, spec), q(w, "phi_2", latent, a, spec))
-        return (alpha * log_pi - least).mean()
+        return (alpha * log_pi - q_actor(w, latent, a, spec)).mean()
 
     loss_2, g_2 = eq_9(w), gradients(eq_9, w, of(w, ("psi_actor", "theta")))
     log_pi = policy(w, features, chance.noise, spec)[1]

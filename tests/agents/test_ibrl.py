@@ -40,10 +40,10 @@ def make(config: IBRLConfig = CONFIG) -> IBRL:
     return agent
 
 
-@pytest.fixture
-def agent() -> IBRL:
+@pytest.fixture(params=[2, 4], ids=lambda count: f"{count}-critics")
+def agent(request: pytest.FixtureRequest) -> IBRL:
     """Return an agent whose actor and critics have moved since it began with the clone."""
-    agent = make()
+    agent = make(replace(CONFIG, critics=request.param))
     torch.manual_seed(2)
     parts = agent.networks.actor, agent.networks.critic, agent.critic_target
     for weight in (weight for part in parts for weight in part.parameters()):
@@ -61,11 +61,15 @@ def observations(seed: int) -> dict[str, torch.Tensor]:
 
 
 def values(
-    agent: IBRL, critic: Callable[..., tuple[torch.Tensor, torch.Tensor]]
+    agent: IBRL, critic: Callable[..., tuple[torch.Tensor, ...]], pair: torch.Tensor | None
 ) -> Callable[..., torch.Tensor]:
+    """Return the rule of two heads or of this pair; without a pair, of the mean of four."""
+
     def value(encoded: dict[str, torch.Tensor], action: torch.Tensor) -> torch.Tensor:
-        first, second = critic(agent.networks.critic_fusion(encoded), action)
-        return torch.stack([first, second]).min(dim=0).values
+        each = torch.stack(critic(agent.networks.critic_fusion(encoded), action))
+        if len(each) == 2:
+            return each.amin(dim=0)
+        return each.mean(dim=0) if pair is None else torch.minimum(each[pair[0]], each[pair[1]])
 
     return value
 
@@ -78,7 +82,7 @@ def test_acting_takes_the_action_of_the_higher_value(agent: IBRL) -> None:
     assert imitator is not None
     own = networks.actor(networks.actor_latent(encoded))
     cloned = imitator["actor"](imitator["fusion"](encoded))
-    value = values(agent, networks.critic.values)
+    value = values(agent, networks.critic.values, None)
     is_cloned = value(encoded, cloned) > value(encoded, own)
     assert 4 < int(is_cloned.sum()) < SIZE - 4
     action = agent.act(observation, explore=False, step=0)
@@ -106,7 +110,7 @@ def test_the_critic_learns_the_value_of_the_better_action(agent: IBRL) -> None:
     encoded = networks.encoders(batch.next_observation, noise.next_shifts)
     own = networks.actor(networks.actor_latent(encoded)) + noise.next_noise
     cloned = imitator["actor"](imitator["fusion"](encoded))
-    value = values(before, before.critic_target["critic"].values)  # type: ignore[arg-type]
+    value = values(before, before.critic_target["critic"].values, noise.pair)  # type: ignore[arg-type]
     best = torch.maximum(value(encoded, own.clamp(-1, 1)), value(encoded, cloned))
     assert metrics["target_q"].item() == pytest.approx((reward + 0.97 * best).mean().item(), 1e-5)
     # Neither the cloned policy nor the encoders move, but the actor and the critic do.

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from merl.accelerate import twins
+from merl.accelerate import joint_heads
 from merl.agents import AGENTS, ddpg
 from merl.bench.update import ACTIONS, learner_of, noise_batch
 from merl.core import UpdateNoise
@@ -32,7 +32,7 @@ def _device(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(torch, "Generator", OnHost)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
-    for module in (frames, twins):
+    for module in (frames, joint_heads):
         monkeypatch.setattr(module, "compute_dtype", lambda weight: weight.dtype)
     monkeypatch.setattr(
         ddpg, "adam", lambda weights, *_, **__: torch.optim.Adam(weights, foreach=True)
@@ -49,7 +49,7 @@ def on_a_card(agent: str) -> ddpg.DDPG:
     """Make an agent with both heads of the critic at once, as on a GPU."""
     learner = learner_of(agent, "fp32", DEVICE)
     for critic in (learner.networks.critic, learner.critic_target["critic"]):
-        twins.join_heads(critic)
+        joint_heads.join_heads(critic)
     return learner
 
 

@@ -39,7 +39,7 @@ def update_critic(agent: DDPG) -> None:
     encoded = encoders(batch.observation, draws.shifts)
     with torch.no_grad():
         next_encoded = encoders(batch.next_observation, draws.next_shifts)
-    agent.update_critic(encoded, next_encoded, batch, draws.next_noise)
+    agent.update_critic(encoded, next_encoded, batch, draws)
 
 
 def update_actor(agent: DDPG, *, detached: bool = True) -> None:

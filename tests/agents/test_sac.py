@@ -19,12 +19,14 @@ from bridge import (
     gradients_of,
     moments_of,
     named_cases,
+    pair_of,
     sample_of,
     state_of,
     weather,
     weights_of,
 )
 
+from merl.agents.config import AgentConfig
 from merl.agents.sac import SAC, SACConfig
 from merl.core import Batch, MerlError, UpdateNoise
 
@@ -32,6 +34,7 @@ SMALL = SACConfig(hidden_dim=32, precision="fp32")
 STATE = {"state": 9}
 CASES = [
     Case("state", SMALL, images={}, vectors=STATE),
+    Case("ensemble", replace(SMALL, critics=4), images={}, vectors=STATE),
     Case(
         "other-numbers",
         replace(SMALL, temperature=0.1, target_entropy=-2.5, tau=0.3, learning_rate=3e-3),
@@ -56,8 +59,9 @@ def prepared(case: Case) -> SAC:
     return agent
 
 
-def draws_of(chance: reference_sac.Chance) -> UpdateNoise:
-    return UpdateNoise(chance.shift, chance.shift_next, chance.noise_next, chance.noise)
+def draws_of(chance: reference_sac.Chance, config: AgentConfig) -> UpdateNoise:
+    pair = pair_of(chance, config)
+    return UpdateNoise(chance.shift, chance.shift_next, chance.noise_next, chance.noise, pair)
 
 
 @named_cases(*CASES)
@@ -69,7 +73,7 @@ def test_five_updates_equal_the_reference(case: Case) -> None:
     target_entropy = case.config.target_entropy or -agent.networks.actor.layers[-1].out_features / 2
     for seed in range(5):
         chance, batch = case.chance_of(seed), case.batch_of(seed, torch.float64)
-        metrics = case.learn(agent, batch, draws_of(chance))
+        metrics = case.learn(agent, batch, draws_of(chance, case.config))
         sample = sample_of(case.batch_of(seed))
         truth, report = reference_sac.update(truth, sample, chance, case.spec, target_entropy)
         for name in ("critic_loss", "actor_loss", "alpha_loss", "entropy"):

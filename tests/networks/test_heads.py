@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import pytest
 import torch
 from torch import nn
 
-from merl.networks.critic import TwinCritic
+from merl.networks.critic import Critic
 from merl.networks.heads import MLP, Actor, HeadSize, Norm
 
 
@@ -29,8 +31,18 @@ def test_actions_are_in_minus_one_to_one() -> None:
     assert (actor(torch.randn(500, 10)) > 0.9).all()
 
 
+def test_the_pair_of_a_target_is_drawn_from_all_pairs() -> None:
+    generator = torch.Generator().manual_seed(0)
+    assert Critic(10, 4, HeadSize(3, 8)).draw_pair(generator) is None
+    critic = Critic(10, 4, HeadSize(3, 8), count=5)
+    pairs = [tuple(sorted(critic.draw_pair(generator).tolist())) for _ in range(1000)]
+    counts = [pairs.count(pair) for pair in combinations(range(5), 2)]
+    assert sum(counts) == 1000
+    assert min(counts) > 60  # each is drawn in a tenth: 100, with a deviation of 9.5
+
+
 def test_twin_heads_share_no_weights() -> None:
-    critic = TwinCritic(10, 4, HeadSize(3, 32))
+    critic = Critic(10, 4, HeadSize(3, 32))
     latent, action = torch.randn(50, 10), torch.rand(50, 4)
     q1, q2 = critic(latent, action)
     assert q1.shape == q2.shape == (50,)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import cast
+
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 
-from merl.core import Transition
+from merl.core import Agent, Batch, Transition
+from merl.experiments.presets import compose
 from merl.networks.augmentation import RandomShift, shift
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.replay.mixing import INTENDED, MixedReplay
+from merl.training.loop import Randomness
+from merl.training.updating import make_update
 
 OBSERVATION = spaces.Dict(
     {
@@ -57,6 +63,30 @@ def test_the_first_samples_are_demonstrations(ratio: float, count: int) -> None:
     moved = batch.to(torch.device("meta")).shown
     assert moved is not None
     assert moved.is_meta
+
+
+def test_the_share_of_demonstrations_changes_during_a_run() -> None:
+    config = dataclasses.replace(
+        compose("smoke", "reach_duplo"),
+        demos_ratio=0.75,
+        demos_ratio_end=0.25,
+        demos_ratio_steps=1000,
+    )
+    config = dataclasses.replace(config, replay=dataclasses.replace(config.replay, batch_size=16))
+    mixed = MixedReplay(replay_of(0.1), [replay_of(0.7, intended=0.7)], config.demos_ratio)
+    shown: list[int] = []
+
+    class Counting:
+        def update(self, batch: Batch, *, step: int) -> dict[str, torch.Tensor]:
+            assert batch.shown is not None
+            shown.append(len(batch.shown))
+            return {}
+
+    agent, cpu = cast(Agent, Counting()), torch.device("cpu")
+    update = make_update(agent, mixed, Randomness(0), config, cpu, print)
+    for step in (0, 500, 1000, 5000):
+        update(step)
+    assert shown == [12, 8, 4, 4]
 
 
 def test_random_shifts_belong_to_their_samples() -> None:

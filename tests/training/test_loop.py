@@ -417,6 +417,19 @@ def test_updates_on_the_device_equal_those_from_the_host(agent: MERLConfig) -> N
         assert torch.equal(one, other)
 
 
+def test_an_update_from_the_host_takes_a_changing_number_of_demonstrations() -> None:
+    run, twin = (SmallRun(CONFIG) for _ in range(2))
+    run.finish()
+    twin.finish()
+    batch = run.replay.sample(8, np.random.default_rng(0))
+    batches = [dataclasses.replace(batch, shown=batch.action[:n]) for n in (4, 4, 3, 1)]
+    update = UpdateFromHost(run.agent, iter(batches).__next__)
+    for step, each in enumerate(batches):
+        metrics, expected = update(step), twin.agent.update(each, step=step)
+        assert all(torch.equal(metrics[name], expected[name]) for name in expected)
+    assert torch.equal(run.weights(), twin.weights())
+
+
 @pytest.mark.parametrize("agent", NOISES, ids=["fixed", "scheduled"])
 def test_updates_with_batches_copied_from_the_host_give_the_same_weights(agent: MERLConfig) -> None:
     """The code for a GPU without a copy of the replay runs on the CPU."""

@@ -127,19 +127,21 @@ class UpdateFromHost:
 
     Args:
         agent: the learner, on a GPU.
-        draw: returns a batch on the host, always of the same shape.
+        draw: returns a batch on the host. The update is recorded anew where the sizes differ from
+            those of the last batch, which happens where the share of demonstrations changes.
     """
 
     def __init__(self, agent: Accelerable, draw: Callable[[], Batch]) -> None:
-        self._draw, self._device = draw, agent.device
+        self._draw, self._agent = draw, agent
         self._on_device: Batch | None = None  # the graph reads this batch
         self._recorded = Recorded(agent, self._batch)
 
     def __call__(self, step: int) -> dict[str, Tensor]:
         """Make one update at `step` and return its metrics, scalars on the device."""
         batch = self._draw()
-        if self._on_device is None:
-            self._on_device = batch.to(self._device)
+        if self._on_device is None or _sizes(batch) != _sizes(self._on_device):
+            self._on_device = batch.to(self._agent.device)
+            self._recorded = Recorded(self._agent, self._batch)
         else:
             _overwrite(self._on_device, batch)
         return self._recorded(step)
@@ -153,6 +155,10 @@ def _overwrite(target: Batch, batch: Batch) -> None:
     """Copy a batch into the tensors of another one, without waiting for a GPU."""
     for old, new in zip(_tensors(target), _tensors(batch), strict=True):
         old.copy_(new.pin_memory() if old.is_cuda else new, non_blocking=True)
+
+
+def _sizes(batch: Batch) -> list[torch.Size]:
+    return [tensor.shape for tensor in _tensors(batch)]
 
 
 def _tensors(batch: Batch) -> list[Tensor]:

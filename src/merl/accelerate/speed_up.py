@@ -1,4 +1,4 @@
-"""Faster forms of an agent's networks: both heads of the critic at once, and torch.compile."""
+"""Faster forms of an agent's networks: all heads of the critic at once, and torch.compile."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from merl.accelerate.twins import join_heads
+from merl.accelerate.joint_heads import join_heads
 from merl.agents.ddpg import DDPG
 from merl.core import Agent
 

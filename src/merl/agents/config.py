@@ -78,6 +78,10 @@ class AgentConfig(ObservationConfig):
     constant."""
     learning_rate_steps: Annotated[int, Range(1, 10**12)] = 500_000
     """Environment steps of the decay of the step size."""
+    critics: Annotated[int, Range(2, 100)] = 2
+    """Q-functions. A target is the smaller of two values, and so is what the actor follows. With
+    more than two (RLPD: 10), a target's two are drawn at random for each update, and the actor
+    follows the mean of all."""
     critic_loss: CriticLoss = "mse"
     """Loss of the critic: the mean squared error (mse), or the cross-entropy of a histogram of
     returns (hl_gauss; Farebrother et al. 2024)."""
@@ -188,22 +192,22 @@ class AgentConfig(ObservationConfig):
 
     def noise(self, step: int) -> float:
         """Return the exploration noise's standard deviation after `step` environment steps."""
-        return _decayed(self.noise_std, self.noise_std_end, step / self.noise_steps)
+        return decayed(self.noise_std, self.noise_std_end, step / self.noise_steps)
 
     def step_size(self, step: int) -> float:
         """Return Adam's step size after `step` environment steps."""
         share = step / self.learning_rate_steps
-        return _decayed(self.learning_rate, self.learning_rate_end, share)
+        return decayed(self.learning_rate, self.learning_rate_end, share)
 
     def cloning(self, step: int) -> float:
         """Return the weight of the cloning term after `step` environment steps."""
         if self.clone_steps is None:
             return self.clone_weight
-        return _decayed(self.clone_weight, 0.0, step / self.clone_steps)
+        return decayed(self.clone_weight, 0.0, step / self.clone_steps)
 
 
-def _decayed(start: float, end: float | None, share: float) -> float:
-    """Return a value after this share of a linear decay; constant without an end."""
+def decayed(start: float, end: float | None, share: float) -> float:
+    """Return a value after this share of a linear change; constant without an end."""
     return start if end is None else start + min(share, 1.0) * (end - start)
 
 

@@ -27,7 +27,7 @@ from merl.agents.networks import make_networks
 from merl.agents.optimizers import adam, load_optimizer, set_step_size, step_optimizer
 from merl.core import Batch, FrameTransforms, UpdateNoise, UpdatePlan
 from merl.networks.augmentation import RandomShift, draw_shifts
-from merl.networks.critic import TwinCritic
+from merl.networks.critic import Critic
 from merl.networks.heads import Actor, GaussianActor
 from merl.networks.settings import with_torch_settings
 
@@ -142,7 +142,7 @@ class DDPG:
             encoded = encoders(batch.observation, noise.shifts)
             with torch.no_grad():
                 next_encoded = encoders(batch.next_observation, noise.next_shifts)
-        metrics = self.update_critic(encoded, next_encoded, batch, noise.next_noise)
+        metrics = self.update_critic(encoded, next_encoded, batch, noise)
         # Reuse the features of o_t from before the critic's step, without gradient.
         encoded = {key: features.detach() for key, features in encoded.items()}
         metrics |= self.update_actor(encoded, batch, noise.actor_noise, plan)
@@ -156,43 +156,44 @@ class DDPG:
         encoded: Mapping[str, Tensor],
         next_encoded: Mapping[str, Tensor],
         batch: Batch,
-        next_noise: Tensor,
+        noise: UpdateNoise,
     ) -> dict[str, Tensor]:
-        """Move both Q-functions, the critic's fusion and the encoders towards y (Eq. 1)."""
+        """Move the Q-functions, the critic's fusion and the encoders towards y (Eq. 1)."""
         networks = self.networks
         # Separate blocks: autocast would reuse weights that it cast without gradient.
         with self._arithmetic(), torch.no_grad():
-            next_action, bonus = self.next_action(next_encoded, next_noise)
-            next_q = self.target_q(next_encoded, next_action)
+            next_action, bonus = self.next_action(next_encoded, noise)
+            next_q = self.target_q(next_encoded, next_action, noise.pair)
         with self._arithmetic():
             latent = networks.critic_fusion(encoded)  # (B, d)
-            first, second = networks.critic(latent, batch.action)
+            outputs = networks.critic(latent, batch.action)
         y = batch.reward + batch.discount * (next_q + bonus)  # (B,)
-        loss = networks.critic.returns.loss(first, second, y)
+        loss = networks.critic.loss(outputs, y)
         step_optimizer(self.critic_optimizer, loss, self.critic_parameters)
-        q1, q2 = (networks.critic.returns.value(output.detach()) for output in (first, second))
+        q = torch.stack([networks.critic.returns.value(output.detach()) for output in outputs])
         return {
             "critic_loss": loss.detach(),
-            "q": q1.mean(),
-            "q_gap": (q1 - q2).abs().mean(),
+            "q": q[0].mean(),
+            "q_gap": (q.amax(dim=0) - q.amin(dim=0)).mean(),
             "target_q": y.mean(),
             "reward": batch.reward.mean(),
         }
 
     def next_action(
-        self, next_encoded: Mapping[str, Tensor], noise: Tensor
+        self, next_encoded: Mapping[str, Tensor], noise: UpdateNoise
     ) -> tuple[Tensor, Tensor | float]:
         """Return pi(o_{t+n}) + epsilon, (B, A), and the bonus added to its value: 0."""
-        action = self.networks.actor(self.networks.actor_latent(next_encoded)) + noise
+        action = self.networks.actor(self.networks.actor_latent(next_encoded)) + noise.next_noise
         return action.clamp(-1.0, 1.0), 0.0
 
-    def target_q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
-        """Return the smaller of the target critic's two values, (B,)."""
+    def target_q(
+        self, encoded: Mapping[str, Tensor], action: Tensor, pair: Tensor | None
+    ) -> Tensor:
+        """Return the smaller of two values of the target critic, (B,); see `Critic.smaller`."""
         latent = self._target_part("critic_fusion")(encoded)
         critic = self._target_part("critic")
-        assert isinstance(critic, TwinCritic)
-        q1, q2 = critic.values(latent, action)
-        return torch.minimum(q1, q2)
+        assert isinstance(critic, Critic)
+        return critic.smaller(latent, action, pair)
 
     def update_actor(
         self, encoded: Mapping[str, Tensor], batch: Batch, noise: Tensor, plan: UpdatePlan
@@ -223,12 +224,11 @@ class DDPG:
         return better_loss(mean, batch, value)
 
     def q(self, encoded: Mapping[str, Tensor], action: Tensor) -> Tensor:
-        """Return min_k Q_phi_k(o_t, a), (B,), differentiable in the action alone."""
+        """Return `Critic.rating`, min_k Q_phi_k(o_t, a), (B,), differentiable in a alone."""
         with torch.no_grad():
             latent = self.networks.critic_fusion(encoded)
         with frozen(self.networks.critic):
-            q1, q2 = self.networks.critic.values(latent, action)
-        return torch.minimum(q1, q2)
+            return self.networks.critic.rating(latent, action)
 
     @torch.no_grad()
     def update_target(self) -> None:
@@ -250,7 +250,8 @@ class DDPG:
             self.epsilon(torch.randn(shape, generator=generator, device=self.device), plan)
             for _ in range(2)
         )
-        return UpdateNoise(shifts, next_shifts, next_noise, noise)
+        pair = self.networks.critic.draw_pair(generator)
+        return UpdateNoise(shifts, next_shifts, next_noise, noise, pair)
 
     def frame_transforms(self, noise: UpdateNoise) -> tuple[FrameTransforms, FrameTransforms]:
         """Return the shifts of o_t and o_{t+n} as frame transforms, which the replay applies."""

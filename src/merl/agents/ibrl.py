@@ -17,7 +17,7 @@ from torch import Tensor
 
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
-from merl.core import MerlError
+from merl.core import MerlError, UpdateNoise
 from merl.networks.settings import with_torch_settings
 
 
@@ -58,18 +58,18 @@ class IBRL(DDPG):
         networks = self.networks
         encoded = networks.encoders({key: observation[key] for key in self.senses})
         cloned, latent = networks.imitated(encoded), networks.critic_fusion(encoded)
-        of_own, of_cloned = (
-            torch.minimum(*networks.critic.values(latent, action)) for action in (own, cloned)
-        )
+        of_own, of_cloned = (networks.critic.rating(latent, action) for action in (own, cloned))
         return better(own, cloned, of_own, of_cloned)
 
     def next_action(
-        self, next_encoded: Mapping[str, Tensor], noise: Tensor
+        self, next_encoded: Mapping[str, Tensor], noise: UpdateNoise
     ) -> tuple[Tensor, Tensor | float]:
         """Return the better of `DDPG.next_action` and the cloned policy's action, (B, A), and 0."""
         own, bonus = super().next_action(next_encoded, noise)
         cloned = self.networks.imitated(next_encoded)
-        of_own, of_cloned = (self.target_q(next_encoded, action) for action in (own, cloned))
+        of_own, of_cloned = (
+            self.target_q(next_encoded, action, noise.pair) for action in (own, cloned)
+        )
         return better(own, cloned, of_own, of_cloned), bonus
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from merl.agents.config import AgentConfig, ObservationConfig
 from merl.core import MerlError
 from merl.modalities import Modality, ObservationSpec, modalities_of
-from merl.networks.critic import TwinCritic
+from merl.networks.critic import Critic
 from merl.networks.encoders import EncoderOptions, make_encoder
 from merl.networks.encoders.pretrained import TimmEncoder
 from merl.networks.fusion import GROUPS, Concatenation, Fusion
@@ -36,7 +36,7 @@ class Networks(nn.Module):
     Attributes:
         encoders: f_xi and g_zeta, trained by the critic's loss.
         critic_fusion: h_psi of the critic.
-        critic: Q_phi1 and Q_phi2.
+        critic: Q_phi1 and Q_phi2, or an ensemble.
         actor_fusion: h_psi of the actor; None if the actor uses the critic's.
         actor: pi_theta.
         policy_average: moving average of the actor and its fusion, which acts in evaluation and
@@ -48,7 +48,7 @@ class Networks(nn.Module):
         self,
         encoders: Encoders,
         critic_fusion: Fusion | Concatenation,
-        critic: TwinCritic,
+        critic: Critic,
         actor_fusion: Fusion | Concatenation | None,
         actor: Actor | GaussianActor,
     ) -> None:
@@ -178,11 +178,11 @@ def make_networks(
     if config.fusion == "decoupled":
         actor_fusion = _fusion(config, senses, share)
     size = HeadSize(config.head_layers, config.hidden_dim, "layer" if config.head_norm else "none")
-    critic = TwinCritic(critic_fusion.latent_dim, action_dim, size, _returns(config))
+    critic = Critic(critic_fusion.latent_dim, action_dim, size, _returns(config), config.critics)
     policy = actor((actor_fusion or critic_fusion).latent_dim, action_dim, size)
     networks = Networks(encoders, critic_fusion, critic, actor_fusion, policy)
     orthogonal(networks)
-    for head in (critic.q1, critic.q2):
+    for head in critic.heads:
         critic.returns.start_at_zero(head.output.bias)
     if config.actor_average is not None:
         networks.start_average()

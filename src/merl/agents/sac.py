@@ -20,7 +20,7 @@ from torch.nn.functional import softplus
 from merl.agents.config import Positive
 from merl.agents.ddpg import DDPG, DDPGConfig
 from merl.agents.optimizers import adam, load_optimizer, step_optimizer
-from merl.core import Batch, MerlError, UpdatePlan
+from merl.core import Batch, MerlError, UpdateNoise, UpdatePlan
 from merl.networks.heads import Actor, GaussianActor
 from merl.networks.settings import with_torch_settings
 
@@ -75,10 +75,10 @@ class SAC(DDPG):
         return torch.tanh(mean + log_std.exp() * noise)
 
     def next_action(
-        self, next_encoded: Mapping[str, Tensor], noise: Tensor
+        self, next_encoded: Mapping[str, Tensor], noise: UpdateNoise
     ) -> tuple[Tensor, Tensor | float]:
         """Return a ~ pi(o_{t+n}), (B, A), and -alpha log pi(a | o_{t+n}), (B,)."""
-        action, log_prob, _ = self._sample(next_encoded, noise)
+        action, log_prob, _ = self._sample(next_encoded, noise.next_noise)
         return action, -self.log_alpha.exp() * log_prob
 
     def update_actor(

@@ -133,12 +133,14 @@ class UpdateNoise:
         next_noise: epsilon of the target's action, (B, A): scaled and clipped; in SAC standard
             normal.
         actor_noise: epsilon of the actor's action, in the same form.
+        pair: the two Q-functions of the target, int64 (2,); None if there are no others.
     """
 
     shifts: dict[str, Tensor]
     next_shifts: dict[str, Tensor]
     next_noise: Tensor
     actor_noise: Tensor
+    pair: Tensor | None = None
 
 
 class UpdatePlan(NamedTuple):

@@ -144,6 +144,7 @@ HEAD_LAYERS = {"move_box": 6, "lift_box": 6}
 
 IMITATING = {
     "demos_ratio": 1.0,
+    "demos_ratio_end": None,
     "demos_pretrain": 0,
     "num_envs": 1,
     "synchronous": True,

@@ -22,15 +22,14 @@ class Scalar(nn.Module):
         """Return the output (B,) unchanged."""
         return output
 
-    def loss(self, first: Tensor, second: Tensor, y: Tensor) -> Tensor:
-        """Return the sum of both critics' losses.
+    def loss(self, output: Tensor, y: Tensor) -> Tensor:
+        """Return the loss of one head, a scalar.
 
         Args:
-            first: output of Q_1.
-            second: output of Q_2.
+            output: the head's output.
             y: targets, (B,).
         """
-        return (first - y).square().mean() + (second - y).square().mean()
+        return (output - y).square().mean()
 
     def start_at_zero(self, bias: Tensor) -> None:
         """Do nothing: with zero bias, the initial values are near 0 already."""
@@ -79,11 +78,9 @@ class HLGauss(nn.Module):
         cdf = torch.erf((edges - y[:, None]) / (math.sqrt(2.0) * self.SIGMA * self.width))
         return cdf.diff(dim=-1) / (cdf[:, -1:] - cdf[:, :1])
 
-    def loss(self, first: Tensor, second: Tensor, y: Tensor) -> Tensor:
-        """Return the sum of both critics' cross-entropies; see `Scalar.loss`."""
-        histogram = self.histogram(y)
-        first_loss, second_loss = (functional.cross_entropy(q, histogram) for q in (first, second))
-        return first_loss + second_loss
+    def loss(self, output: Tensor, y: Tensor) -> Tensor:
+        """Return the cross-entropy of one head, a scalar; see `Scalar.loss`."""
+        return functional.cross_entropy(output, self.histogram(y))
 
     @torch.no_grad()
     def start_at_zero(self, bias: Tensor) -> None:

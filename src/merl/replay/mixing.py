@@ -25,7 +25,10 @@ class MixedReplay:
         own: the replay of the run.
         demos: the demonstrations, the first of which are not empty, with the intended actions as
             observation `INTENDED`; each step of any of them has the same probability.
-        ratio: share of the demonstrations in a batch, in (0, 1].
+        ratio: share of the demonstrations in a batch; at least one sample is of them.
+
+    Attributes:
+        ratio: the share in the next batch, which may change during a run.
     """
 
     def __init__(self, own: ReplayBuffer, demos: Sequence[ReplayBuffer], ratio: float) -> None:

@@ -54,6 +54,8 @@ def make_update(
             update = update_on_cpu(agent, replay, randomness, config)
 
     def update_with_settings(step: int) -> dict[str, Tensor]:
+        if isinstance(replay, MixedReplay):
+            replay.ratio = config.demos_share(step)
         with torch_settings(device, config.threads):
             return update(step)
 

@@ -1,4 +1,4 @@
-"""Both heads of a twin critic in the same kernels."""
+"""All heads of a critic in the same kernels."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ import pytest
 import torch
 from torch import nn
 
-from merl.accelerate.twins import join_heads
-from merl.networks.critic import TwinCritic
+from merl.accelerate.joint_heads import join_heads
+from merl.networks.critic import Critic
 from merl.networks.heads import HeadSize, Norm
 
 
 @pytest.mark.parametrize("layers", [1, 4])
 @pytest.mark.parametrize("norm", ["layer", "none"])
-def test_twins_at_once_equal_twins_one_by_one(layers: int, norm: Norm) -> None:
+@pytest.mark.parametrize("count", [2, 5])
+def test_heads_at_once_equal_heads_one_by_one(layers: int, norm: Norm, count: int) -> None:
     """Compare values, and gradients of the action and of every weight, also in bf16."""
     torch.manual_seed(1)  # in bf16, a few seeds round a value to the other side of a ReLU
-    critic = TwinCritic(10, 4, HeadSize(layers, 32, norm)).double()
+    critic = Critic(10, 4, HeadSize(layers, 32, norm), count=count).double()
     for parameter in critic.parameters():
         nn.init.normal_(parameter, 0.0, 0.3)
     latent, action = torch.randn(50, 10), torch.rand(50, 4, requires_grad=True)
@@ -26,13 +27,14 @@ def test_twins_at_once_equal_twins_one_by_one(layers: int, norm: Norm) -> None:
     joined = copy.deepcopy(critic)
     join_heads(joined)
 
-    def values_and_gradients(critic: TwinCritic, dtype: torch.dtype) -> list[torch.Tensor]:
+    def values_and_gradients(critic: Critic, dtype: torch.dtype) -> list[torch.Tensor]:
         critic.to(torch.float64 if dtype == torch.float64 else torch.float32)
         state = latent.to(next(critic.parameters()).dtype)
         with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-            q1, q2 = critic(state, action.to(state.dtype))
+            q = critic(state, action.to(state.dtype))
         inputs = [action, *critic.parameters()]
-        return [q1, q2, *torch.autograd.grad((q1 * q2).sum(), inputs)]
+        product = torch.stack(q).prod(dim=0).sum()
+        return [*q, *torch.autograd.grad(product, inputs)]
 
     for dtype, bound in ((torch.float64, 1e-12), (torch.float32, 1e-5), (torch.bfloat16, 1e-5)):
         one_by_one, at_once = (values_and_gradients(each, dtype) for each in (critic, joined))

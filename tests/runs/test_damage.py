@@ -94,7 +94,7 @@ def test_a_flipped_bit_is_named_or_changes_nothing(
     right = weights(expected)
     found = {"sound": 0, "damaged": 0}
     for name in files_of(run):
-        for trial in range(8):
+        for trial in range(4):
             copy = copy_of(run, tmp_path)
             if not flip(copy / name, dice):
                 continue

@@ -134,8 +134,9 @@ def test_a_run_resumes_bit_for_bit_and_its_policy_acts(
     assert read_metrics(parts)["step"][-1] < 60
     monkeypatch.setattr(Senses, "stops", 0)
     assert main(["resume", str(parts)]) == 0
+    resumed = weights(parts)
     for name, value in weights(whole).items():
-        assert torch.equal(value, weights(parts)[name]), name
+        assert torch.equal(value, resumed[name]), name
     assert main(["evaluate", str(whole), "--episodes", "2"]) == 0
     policy = merl.load_policy(whole)
     env = adapt(Senses())

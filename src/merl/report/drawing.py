@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -109,11 +109,14 @@ def time_axis(axes: Axes, seconds: Curve) -> None:
     top.set_xlabel(f"{unit} of wall-clock", color=MUTED)
 
 
-def direct_labels(figure: Figure, axes: Axes, labels: Sequence[Label]) -> None:
-    """Write labels right of a panel at their heights; move them apart where they overlap."""
-    if not labels:
-        return
-    figure.draw_without_rendering()  # computes the layout, and with it the panel's height
+def direct_labels(figure: Figure, labels: Mapping[Axes, Sequence[Label]]) -> None:
+    """Write labels right of each panel at their heights; move them apart where they overlap."""
+    figure.draw_without_rendering()  # computes the layout, and with it the panels' heights
+    for axes, of_axes in labels.items():
+        _label_panel(figure, axes, of_axes)
+
+
+def _label_panel(figure: Figure, axes: Axes, labels: Sequence[Label]) -> None:
     points = axes.get_window_extent().height * 72 / figure.dpi
     heights = [LABEL_SIZE * 1.35 * (1 + label.text.count("\n")) / points for label in labels]
     bottom, top = axes.get_ylim()

@@ -84,8 +84,7 @@ def learning_curve(
     if "time/seconds" in metrics:
         time_axis(above, curve_of(metrics, "time/seconds"))
     headline(figure, f"{_title(run_dir)}{_missing_note(metrics)}")
-    for axes, of_axes in labels.items():
-        direct_labels(figure, axes, of_axes)
+    direct_labels(figure, labels)
     return save(figure, Path(output))
 
 
@@ -148,7 +147,7 @@ def learning_curves(
         around = "minimum to maximum" if band == "range" else "its 95 % bootstrap interval"
         note = f"bold: mean over the seeds; band: {around}; thin: each seed"
         axes.set_title(note, loc="left", color=MUTED, size=LABEL_SIZE)
-    direct_labels(figure, axes, labels)
+    direct_labels(figure, {axes: labels})
     return save(figure, Path(output))
 
 
@@ -187,8 +186,7 @@ def reward_terms(runs: Mapping[str, Run], output: Path | str) -> Path:
             labels[axes].append(Label(text, last, color, "bold"))
         value_axis(axes, [], False)
         step_axis(axes, metrics["step"])
-    for axes, of_axes in labels.items():
-        direct_labels(figure, axes, of_axes)
+    direct_labels(figure, labels)
     return save(figure, Path(output))
 
 

@@ -50,5 +50,5 @@ def draw_profiles(scores: Mapping[str, Array], output: Path) -> Path:
     axes.set_xlim(0, float(thresholds[-1]))
     axes.set_xlabel("score", color=MUTED)
     value_axis(axes, [], True)
-    direct_labels(figure, axes, labels)
+    direct_labels(figure, {axes: labels})
     return save(figure, output)

@@ -43,7 +43,7 @@ class Critic(nn.Module):
     @property
     def heads(self) -> list[MLP]:
         """All heads, in order."""
-        return [self.get_submodule(name) for name in self._names]  # type: ignore[misc]
+        return [getattr(self, name) for name in self._names]
 
     def forward(self, latent: Tensor, action: Tensor) -> tuple[Tensor, ...]:
         """Map latent (B, d) and action (B, A) to each head's output: (B,), or logits (B, bins)."""

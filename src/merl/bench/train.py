@@ -133,7 +133,7 @@ def table(result: dict[str, Any]) -> Table:
 
 def _sides() -> dict[str, dict[str, Any]]:
     """Return {name of a variant: its fields of `TrainConfig`}."""
-    several = max(4, len(os.sched_getaffinity(0)) - 1)
+    several = max(8, len(os.sched_getaffinity(0)) - 1)
     return {
         STRICT: {"synchronous": True, "num_envs": 1},
         "one environment, beside the learner": {"synchronous": False, "num_envs": 1},

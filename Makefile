@@ -8,7 +8,7 @@ PYTHON := $(shell for p in python3.12 python3.11; do "$$p" --version >/dev/null 
 VENV := .venv
 BIN := $(VENV)/bin
 MINUTES := 10
-PYTEST_FLAGS := --numprocesses 3 --dist worksteal --durations 10
+PYTEST_FLAGS := --numprocesses 2 --dist worksteal --durations 10
 
 .PHONY: help setup demo train test test-all docs clean
 

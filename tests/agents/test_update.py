@@ -236,10 +236,12 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Case, "agent", agent)
 
 
-TWINS_AT_ONCE = [case for case in CASES if case.name in ("six-layers", "without-head-norm")]
+HEADS_AT_ONCE = [
+    case for case in CASES if case.name in ("six-layers", "without-head-norm", "ensemble")
+]
 
 
-@named_cases(*TWINS_AT_ONCE)
+@named_cases(*HEADS_AT_ONCE)
 def test_update_with_heads_at_once_as_on_a_gpu(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     as_on_a_gpu(monkeypatch)
     check_in_double_precision(case, updates=5)

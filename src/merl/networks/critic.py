@@ -59,7 +59,7 @@ class Critic(nn.Module):
         return tuple(self.returns.value(output) for output in self(latent, action))
 
     def smaller(self, latent: Tensor, action: Tensor, pair: Tensor | None = None) -> Tensor:
-        """Return the smaller value (B,) of the two heads, or of a `pair` (2,) of an ensemble's."""
+        """Return the smaller value (B,) of the two heads, or of the `pair` (2,) in an ensemble."""
         values = self.values(latent, action)
         if pair is not None:
             values = torch.stack(values)[pair].unbind()

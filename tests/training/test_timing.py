@@ -91,6 +91,22 @@ def test_only_open_choices_are_timed(precision: Any, threads: int, tried: set[Ar
     assert timing.step > 0
 
 
+@pytest.mark.parametrize(
+    ("cores", "synchronous", "threads"),
+    [(1, True, {1}), (2, True, {1, 2}), (2, False, {1}), (3, False, {1, 2}), (1, False, {1})],
+)
+def test_a_core_is_left_to_environments_beside_the_updates(
+    cores: int, synchronous: bool, threads: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {*range(cores)})
+    agent = dataclasses.replace(CONFIG.agent, precision="fp32")
+    config = dataclasses.replace(CONFIG, agent=agent, synchronous=synchronous)
+    env = DotEnv()
+    env.length = 10_000
+    timing = measure(config, env, DotEnv(), env.observation_space, torch.device("cpu"))
+    assert {kind.threads for kind in timing.update} == threads
+
+
 def with_compile(torch_compile: Any) -> TrainConfig:
     agent = dataclasses.replace(CONFIG.agent, precision="fp32", torch_compile=torch_compile)
     return dataclasses.replace(CONFIG, agent=agent, threads=1)

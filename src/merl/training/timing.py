@@ -125,9 +125,9 @@ def measure(
 ) -> Timing:
     """Time the update in every arithmetic that the config allows, and the environment's step.
 
-    On a CPU, try the precisions on one thread, then the fastest on all threads. On a GPU, use all
-    threads, and also try the fastest precision compiled. Do not reset, step or render a user's own
-    environments.
+    On a CPU, try the precisions on one thread, then the fastest on all cores, or on all but one if
+    environments step beside the updates. On a GPU, use all threads, and also try the fastest
+    precision compiled. Do not reset, step or render a user's own environments.
 
     Args:
         config: the config of the run.
@@ -141,6 +141,7 @@ def measure(
     """
     cores = len(os.sched_getaffinity(0))
     threads = config.threads or (cores if device.type == "cuda" else 1)
+    most = cores if config.synchronous else cores - 1
     precisions: tuple[Literal["fp32", "bf16"], ...] = ("fp32",)
     compiled = False
     if isinstance(config.agent, AgentConfig):
@@ -166,8 +167,8 @@ def measure(
     for precision in precisions:
         agent = attempt(Arithmetic(precision, threads, compiled))
     fastest = Timing(update, 0.0).best
-    if config.threads is None and cores > threads:
-        attempt(dataclasses.replace(fastest, threads=cores))
+    if config.threads is None and most > threads:
+        attempt(dataclasses.replace(fastest, threads=most))
     torch.set_num_threads(threads)
     with torch_settings(device):
         step, frame = _time_acting(agent, batch, device), 0.0

@@ -120,7 +120,9 @@ def test_a_killed_run_resumes_bit_exactly(tmp_path: Path) -> None:
     check_killed_run_resumes_exactly(tmp_path, 2)
 
 
-@pytest.mark.parametrize("more", [(), ("--replay.compress",)])
+@pytest.mark.parametrize(
+    "more", [(), pytest.param(("--replay.compress",), marks=pytest.mark.long)]
+)
 def test_a_killed_run_resumes_bit_exactly_after_the_ring_has_wrapped(
     tmp_path: Path, more: tuple[str, ...]
 ) -> None:

@@ -112,7 +112,10 @@ def test_depth_in_other_types_is_the_same_image() -> None:
     assert np.array_equal(adapted["rgba"], np.moveaxis(given["rgba"], 0, -1))
 
 
-@pytest.mark.parametrize("compress", ["--replay.compress", "--replay.no-compress"])
+@pytest.mark.parametrize(
+    "compress",
+    ["--replay.compress", pytest.param("--replay.no-compress", marks=pytest.mark.long)],
+)
 def test_a_run_resumes_bit_for_bit_and_its_policy_acts(
     compress: str,
     tmp_path: Path,

@@ -120,9 +120,7 @@ def test_a_killed_run_resumes_bit_exactly(tmp_path: Path) -> None:
     check_killed_run_resumes_exactly(tmp_path, 2)
 
 
-@pytest.mark.parametrize(
-    "more", [(), pytest.param(("--replay.compress",), marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize("more", [(), pytest.param(("--replay.compress",), marks=pytest.mark.long)])
 def test_a_killed_run_resumes_bit_exactly_after_the_ring_has_wrapped(
     tmp_path: Path, more: tuple[str, ...]
 ) -> None:

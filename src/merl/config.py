@@ -113,7 +113,7 @@ class TrainConfig:
     device: Device = "auto"
     """Device of the networks; auto uses CUDA if it is available."""
     threads: Steps | None = None
-    """CPU threads of the update; if not set, one, or all of them if that is clearly faster."""
+    """CPU threads of the update; if not set, one, or several if that is clearly faster."""
     random_steps: NotNegative = 2000
     """Steps with uniformly random actions at the start ("exploration steps" in Table 1)."""
     seed_steps: NotNegative = 4000

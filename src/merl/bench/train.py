@@ -64,7 +64,8 @@ def run(
     preset = preset or ("paper" if on_gpu else "laptop")
     result: dict[str, Any] = {"repeats": repeats, "steps": steps, "task": task, "preset": preset}
     result |= circumstances()
-    rates, config = steps_per_second(_sides(), task, preset, repeats, steps)
+    several = max(4, compose(preset, task).num_envs, len(os.sched_getaffinity(0)) - 1)
+    rates, config = steps_per_second(_sides(several), task, preset, repeats, steps)
     assert isinstance(config.agent, AgentConfig)
     result |= {
         "precision": config.agent.precision,
@@ -131,9 +132,8 @@ def table(result: dict[str, Any]) -> Table:
     return rows
 
 
-def _sides() -> dict[str, dict[str, Any]]:
-    """Return {name of a variant: its fields of `TrainConfig`}."""
-    several = max(8, len(os.sched_getaffinity(0)) - 1)
+def _sides(several: int) -> dict[str, dict[str, Any]]:
+    """Return {name of a variant: its fields of `TrainConfig`}; the last has several environments."""
     return {
         STRICT: {"synchronous": True, "num_envs": 1},
         "one environment, beside the learner": {"synchronous": False, "num_envs": 1},

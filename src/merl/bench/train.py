@@ -133,7 +133,7 @@ def table(result: dict[str, Any]) -> Table:
 
 
 def _sides(several: int) -> dict[str, dict[str, Any]]:
-    """Return {name of a variant: its fields of `TrainConfig`}; the last has several environments."""
+    """Return {name of a variant: its fields of `TrainConfig`}, up to several environments."""
     return {
         STRICT: {"synchronous": True, "num_envs": 1},
         "one environment, beside the learner": {"synchronous": False, "num_envs": 1},

@@ -51,10 +51,11 @@ def evaluations(path: Path) -> list[tuple[float, float]]:
 
 
 def minutes(curves: list[list[tuple[float, float]]], share: float) -> str:
-    """Return when the mean success over the runs first reaches a share."""
-    for each in zip(*curves, strict=False):
-        if fmean(success for _, success in each) >= share:
-            return f"{fmean(time for time, _ in each):.0f} min"
+    """Return when the mean over the runs of each one's latest success first reaches a share."""
+    for now in sorted(time for curve in curves for time, _ in curve):
+        latest = [[success for time, success in curve if time <= now][-1:] for curve in curves]
+        if all(latest) and fmean(success for (success,) in latest) >= share:
+            return f"{now:.0f} min"
     return "not reached"
 
 

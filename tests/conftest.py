@@ -40,6 +40,17 @@ def _temporary_run_records(tmp_path_factory: pytest.TempPathFactory) -> Iterator
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _curves_are_not_drawn() -> Iterator[None]:
+    """Leave out a run's last figure, a third of the time of a run of seconds.
+
+    Runs in processes of their own draw theirs; so does the run of tests/cli/test_cli.py.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("merl.report.figures.learning_curve", lambda run, output, **_: output)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
     """Use one thread: tests run in parallel on small tensors, so more threads are slower."""

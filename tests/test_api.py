@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
 import threading
 from collections import Counter
 from collections.abc import Mapping
@@ -243,6 +246,26 @@ def test_a_function_makes_the_environment(workers: int, tmp_path: Path) -> None:
     assert outcome.evaluation is not None
     again = merl.evaluate(run, env=make, episodes=2).returns
     assert again == merl.evaluate(run, env=make, episodes=2).returns
+
+
+def test_a_script_trains_without_a_guard(tmp_path: Path) -> None:
+    """The processes of its environments do not run the script again."""
+    script, run = tmp_path / "script.py", tmp_path / "run"
+    small = VECTOR | {"num_envs": 2, "synchronous": False, "run_dir": str(run)}
+    script.write_text(
+        "import toy, merl\n"
+        "print('begins')\n"
+        "class Own(toy.DotEnv):\n"
+        "    def reset(self, **options):\n"
+        "        return super().reset(**options)\n"
+        f"merl.train(env=Own, progress=False, **{small!r})\n"
+    )
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    done = subprocess.run([sys.executable, script], env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("begins") == 1
+    assert "Traceback" not in done.stderr
+    assert list(run.glob("checkpoints/0*"))
 
 
 def test_the_run_records_a_function_that_can_be_imported(tmp_path: Path) -> None:

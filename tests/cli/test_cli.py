@@ -30,6 +30,7 @@ from helpers import flat, wait_for
 from merl.cli import main
 from merl.envs.registration import ENV_IDS
 from merl.evaluation.evaluation import EVALUATION_SEED
+from merl.report.figures import learning_curve
 
 MERL = [sys.executable, "-m", "merl.cli"]
 SMALL_VIDEO = ["--render-size", "64"]
@@ -62,7 +63,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arguments = ["train", "reach_duplo", "--preset", "smoke", "--run-dir", str(folder)]
     arguments += ["--log", "tensorboard"]
     out, err = io.StringIO(), io.StringIO()
-    with small_videos(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        small_videos(),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        patch.setattr("merl.report.figures.learning_curve", learning_curve)
         assert main([*arguments, "--threads", "1", *SMALL_VIDEO]) == 0
     shown = flat(out.getvalue())
     assert shown.startswith("preset smoke (as requested")

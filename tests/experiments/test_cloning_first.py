@@ -18,6 +18,7 @@ from merl.cli import main
 
 TINY = ["--preset", "smoke", "--eval.every", "0", "--threads", "1", "--random-steps", "0"]
 TINY += ["--seed-steps", "100", "--agent.precision", "fp32", "--save-every", "0"]
+TINY += ["--replay.batch-size", "16", "--eval.video", "none"]
 
 
 @pytest.fixture(scope="module")

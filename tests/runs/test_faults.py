@@ -18,7 +18,6 @@ from safetensors.torch import load_file
 
 import merl.cli.resume
 import merl.cli.train
-import merl.report.figures
 import merl.training.setup
 from faults import Ended, Faults, with_faults
 from merl.cli import main
@@ -70,7 +69,6 @@ def run_merl(arguments: list[str], state: Path) -> int:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(state))
         patch.setattr(merl.training.setup, "measure", lambda *_: timing)
-        patch.setattr(merl.report.figures, "learning_curve", lambda run, to, **_: to)
         return main(arguments)
 
 

@@ -50,7 +50,6 @@ def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.setattr(
         "merl.training.setup.measure", lambda *_: Timing({Arithmetic("fp32", 1): 1e-3}, 1e-3)
     )
-    monkeypatch.setattr("merl.report.figures.learning_curve", lambda run, to, **_: to)
     yield
     unruly.__dict__.update(DEFAULT)
     unruly_envs.made.clear()

@@ -1,12 +1,18 @@
-"""Worker processes that start undisturbed by signals, and that never outlive the run."""
+"""Worker processes that start undisturbed by signals and that never outlive the run.
+
+They do not run the user's script again: a script needs no `if __name__ == "__main__":`.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
-from contextlib import ExitStack
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker, util
 from multiprocessing.synchronize import SemLock
+from types import ModuleType
 from typing import Any
 
 from gymnasium.vector import AsyncVectorEnv
@@ -18,6 +24,20 @@ from merl.core.watching import end_with_parent, signals_blocked
 _IGNORED_SIGNALS = ENDING - {signal.SIGTERM}
 """Signals that workers ignore: a terminal or a batch system sends them to the workers, too, but the
 workers must continue until the run has saved and ends them. SIGTERM ends a worker."""
+
+
+@contextmanager
+def _main_module_hidden() -> Iterator[None]:
+    """Keep processes that are spawned in the block from importing the main module.
+
+    They do not need it: functions and classes of a script are sent to them by value.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")  # without a file
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 class Processes(AsyncVectorEnv):
@@ -35,6 +55,7 @@ class Processes(AsyncVectorEnv):
             resource_tracker.ensure_running()
         with ExitStack() as self._starting:
             self._starting.enter_context(signals_blocked(_IGNORED_SIGNALS))
+            self._starting.enter_context(_main_module_hidden())
             try:
                 super().__init__(*args, **{**options, "worker": _work})
             except BaseException:

@@ -110,8 +110,11 @@ def time_axis(axes: Axes, seconds: Curve) -> None:
 
 
 def direct_labels(figure: Figure, labels: Mapping[Axes, Sequence[Label]]) -> None:
-    """Write labels right of each panel at their heights; move them apart where they overlap."""
-    figure.draw_without_rendering()  # computes the layout, and with it the panels' heights
+    """Write labels right of each panel at their heights; move them apart where they overlap.
+
+    The panels' heights are those before the layout, which takes longer than all else here and
+    changes them by a few percent.
+    """
     for axes, of_axes in labels.items():
         _label_panel(figure, axes, of_axes)
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from merl.training.trainer import Trainer
 
 RECENT = 10
-"""Number of training episodes in the shown means."""
+"""Number of training episodes in the shown means; with more environments, one of each."""
 PLAIN_INTERVAL = 30.0
 """Seconds between two progress lines if the output is not a terminal."""
 SPARKS = "▁▂▃▄▅▆▇█"
@@ -82,6 +82,8 @@ class LiveView(Callback):
         self._total, self._minutes = config.steps, config.minutes
         self._step = trainer.setup.progress.step
         self._learning_starts = config.seed_steps
+        # A row of metrics has the episodes of all environments that ended at one step.
+        self._recent = deque(maxlen=max(1, RECENT // config.num_envs))
         _, rows = read_rows(run.path / METRICS_FILE)  # of a resumed run
         self._returns = [float(row["eval/return"]) for row in rows if "eval/return" in row]
         every = config.eval.every
@@ -213,8 +215,7 @@ class LiveView(Callback):
         name = "train/success_end"
         if any(name in row for row in self._recent):  # a row without this metric is a failure
             values += f", success {mean(row.get(name, 0.0) for row in self._recent):.0%}"
-        count = len(self._recent)
-        about = f"the last {count} episodes, with noise" if count > 1 else "one episode, with noise"
+        about = "the newest episodes, with noise"
         if not self._updates:
             about += f"; learning begins at step {self._learning_starts:,}"
         return f"{values} ({about})"

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,7 @@ from safetensors.torch import load_file
 from helpers import flat
 from merl.cli import main
 from merl.demos.demonstrations import Demonstrations
+from merl.demos.recorder import Recorder
 from merl.evaluation.demonstrating import record_episodes
 from merl.report.film import LABEL, MARGIN, SIDE
 from toy import DotEnv
@@ -111,7 +115,13 @@ def test_demonstrations_of_another_task_or_reward_are_refused(
     shutil.copytree(demos, tmp_path / "demos")
     (tmp_path / "demos/demos.json").write_text(json.dumps(index))
     assert main([*train, str(tmp_path / "demos"), "move_box"]) == 2
-    assert "recorded with --reward staged, and the run has paper" in capsys.readouterr().err
+    assert "recorded with reward staged, and the run has paper" in capsys.readouterr().err
+    index["options"] = {"reward": "paper", "occluded": True}
+    (tmp_path / "demos/demos.json").write_text(json.dumps(index))
+    assert main([*train, str(tmp_path / "demos"), "move_box"]) == 2
+    assert "recorded with occluded True, and the run has False" in capsys.readouterr().err
+    assert main([*train, str(demos), "reach_duplo", "--action-repeat", "2"]) == 2
+    assert "use --action-repeat 1" in capsys.readouterr().err
 
 
 def test_an_environment_may_reuse_its_arrays() -> None:
@@ -205,6 +215,21 @@ def test_an_exported_dataset_is_imported_and_learnt_from(
 def test_another_environment_has_no_expert(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demos", "record", "Pendulum-v1"]) != 0
     assert "there is no expert for Pendulum-v1" in flat(capsys.readouterr().err)
+
+
+def test_an_environment_of_the_working_folder(tmp_path: Path) -> None:
+    env, folder = DotEnv(), tmp_path / "toy"
+    recorder = Recorder(folder, "toy:DotEnv", "a test", env.observation_space, env.action_space)
+    for episode in record_episodes(lambda _: np.zeros(1), env, 1, failures=True):
+        recorder.add(episode)
+    assert main(["demos", "export", str(folder), "--to", "robomimic"]) == 0
+    (tmp_path / "my_arm.py").write_text("from toy import DotEnv\ndef make(): return DotEnv()\n")
+    merl = str(Path(sys.executable).with_name("merl"))  # it does not search the working folder
+    command = [merl, "demos", "import", "my_arm:make", "--from", "toy.hdf5", "--out", "out"]
+    path = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(command, cwd=tmp_path, env=path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert Demonstrations.open(tmp_path / "out").steps == len(episode)
 
 
 def test_a_film_strip_shows_what_the_cameras_saw(

@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from merl.core import MerlError
 from merl.demos.demonstrations import Demonstrations
-from merl.demos.episode import Episode
+from merl.demos.episode import Episode, EpisodeRecording
 from merl.demos.recorder import Recorder
 from merl.replay import ReplayConfig
 from merl.replay.mixing import INTENDED
@@ -50,6 +50,33 @@ def demos(tmp_path: Path) -> Demonstrations:
     for seed, steps in enumerate((7, 1, 5)):
         recorder.add(episode(steps, seed, terminated=seed == 2))
     return recorder.demonstrations
+
+
+def test_an_episode_that_was_not_entered_in_the_index_is_written_again(tmp_path: Path) -> None:
+    """A kill between the two files, at the first correction of a run."""
+    (tmp_path / "00000.npz").write_bytes(b"cut")
+    spaces_of = (tmp_path, "move_box", "corrections", OBSERVATION, ACTION)
+    with pytest.raises(MerlError, match="is not empty"):
+        Recorder(*spaces_of)
+    for steps in (3, 4):
+        Recorder(*spaces_of, append=True).add(episode(steps))
+    assert [len(each) for each in Demonstrations.open(tmp_path).episodes()] == [3, 4]
+
+
+def test_success_is_that_of_the_last_step() -> None:
+    """An environment may report its successes alone."""
+    step = np.zeros(1, np.float32)
+    for infos, success, known in (
+        ([{}, {"success": True}], True, False),
+        ([{"success": True}, {}], False, False),
+        ([{}, {}], None, False),
+        ([{"success": True}, {"success": False}], False, True),
+    ):
+        recording = EpisodeRecording({"joint": step})
+        for info in infos:
+            recording.add(step, step, {"joint": step}, 0.0, info)
+        found = recording.finish(terminated=False)
+        assert (found.success, found.successes is not None) == (success, known)
 
 
 def test_episodes_are_read_as_they_were_written(demos: Demonstrations) -> None:

@@ -22,6 +22,7 @@ from merl.demos.episode import Episode
 from merl.demos.exporting import Format, export_demos
 from merl.demos.importing import Rules, Target, import_demos, open_source
 from merl.demos.recorder import Recorder
+from merl.demos.source import at_each_step
 
 OBSERVATION = spaces.Dict(
     {
@@ -40,6 +41,9 @@ FORMATS: list[Format] = ["lerobot", "robomimic", "minari"]
 def episode(steps: int, seed: int) -> Episode:
     """Return an episode with smooth images, which a video keeps almost as they are."""
     rng = np.random.default_rng(seed)
+    solved = np.arange(steps) % 3 == 0  # also in the middle, and in the last of 7 steps
+    if seed == 2:
+        solved = np.arange(steps) == steps - 1
     ramp = np.linspace(0, 150, 24) + 3 * rng.integers(0, 10)
     image = np.broadcast_to(ramp[None, None, :, None], (steps + 1, 16, 24, 3)).astype(np.uint8)
     return Episode(
@@ -54,6 +58,7 @@ def episode(steps: int, seed: int) -> Episode:
         rng.uniform(size=steps).astype(np.float32),
         seed == 2,
         seed != 1,
+        solved & (seed != 1),
     )
 
 
@@ -105,7 +110,15 @@ def test_a_round_trip_changes_nothing(form: str, exported: dict[str, Path], tmp_
         np.testing.assert_array_equal(back.actions, was.actions)
         np.testing.assert_array_equal(back.intended, was.intended)
         np.testing.assert_array_equal(back.rewards, was.rewards)
+        np.testing.assert_array_equal(back.successes, was.successes)
         assert back.terminated == was.terminated
+
+
+def test_a_flag_at_the_last_step_alone_tells_only_the_end() -> None:
+    last = np.array([False, False, True])
+    assert at_each_step(last, terminated=False) is None
+    for known, terminated in ((last, True), (~last, False), (last[2:], False), (last[:2], False)):
+        np.testing.assert_array_equal(at_each_step(known, terminated=terminated), known)
 
 
 def test_videos_keep_every_frame_in_its_place(demos: Demonstrations, tmp_path: Path) -> None:
@@ -266,9 +279,23 @@ def test_without_rewards_success_is_the_reward(exported: dict[str, Path], tmp_pa
     shutil.copy(exported["robomimic"], file)
     with h5py.File(file, "r+") as opened:
         for demo in opened["data"].values():
-            del demo["rewards"]
+            del demo["rewards"], demo.attrs["terminated"]
     found = import_demos(open_source(file), tmp_path / "out", TARGET, Rules())
     assert [line.returned for line in found.lines] == [1.0, 0.0, 1.0]
+    # Else the value of the last state would be that of a reward at every step from then on.
+    assert [each.terminated for each in found.episodes()] == [True, False, True]
+
+
+def test_values_of_another_kind_are_named_in_one_line(
+    exported: dict[str, Path], tmp_path: Path
+) -> None:
+    file = tmp_path / "odd.hdf5"
+    for name, value in {"rewards": ["a"] * 5, "actions": np.zeros(5), "obs/joint": 1.0}.items():
+        shutil.copy(exported["robomimic"], file)
+        with h5py.File(file, "r+") as opened:
+            del opened[f"data/demo_2/{name}"]
+            opened[f"data/demo_2/{name}"] = value
+        assert str(file) in refused(file, tmp_path / "out")
 
 
 def test_an_export_never_replaces_a_file(demos: Demonstrations, tmp_path: Path) -> None:

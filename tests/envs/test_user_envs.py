@@ -124,6 +124,34 @@ def test_unusable_spaces_are_rejected(space: Any, actions: Any, message: str) ->
         adapt(SpaceEnv(space, actions))
 
 
+def test_a_robot_is_connected_once(caplog: pytest.LogCaptureFixture) -> None:
+    """Videos are asked for by default; an environment that has none is not made again for it."""
+    calls: list[str] = []
+
+    class Robot(SpaceEnv):
+        def close(self) -> None:
+            calls.append("close")
+            raise OSError("the motors do not answer")
+
+    def make() -> Robot:
+        calls.append("make")
+        return Robot(vector(2))
+
+    env = make_user_env("make()", "rgb_array", make=make)
+    assert calls == ["make"]
+    env.close()
+    assert calls == ["make", "close"]
+    assert "the motors do not answer" in caplog.text
+
+    def broken() -> Robot:
+        calls.append("make")
+        raise OSError("no such port")
+
+    with pytest.raises(EnvironmentFailed, match="no such port"):
+        make_user_env("broken()", "rgb_array", make=broken)
+    assert calls == ["make", "close", "make"]
+
+
 def test_environments_are_found_by_id_and_by_function(tmp_path: Path, monkeypatch: Any) -> None:
     assert make_user_env("merl.envs.dot:whole", "rgb_array").render_mode == "rgb_array"
     pendulum = make_user_env("Pendulum-v1")

@@ -147,6 +147,14 @@ def test_two_axes_are_a_depth_image_or_a_history(
     assert used.convert(space.sample()).shape == shape
 
 
+@pytest.mark.parametrize(("dtype", "none"), [(np.uint16, 65535), (np.float32, np.inf)])
+def test_depth_beyond_its_bounds_is_clipped(dtype: type, none: float) -> None:
+    used = user_key("x", spaces.Box(100, 5000, (20, 30), dtype), "auto")
+    assert used is not None
+    seen = used.convert(np.array([[0, none] * 15] * 20, dtype))
+    assert (seen.min(), seen.max()) == (100, 5000)
+
+
 # -- advice ---------------------------------------------------------------------------------------
 
 

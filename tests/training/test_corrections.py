@@ -82,6 +82,18 @@ def test_corrected_steps_are_executed_and_become_demonstrations(demos: Path) -> 
     assert np.count_nonzero(person.executed == np.float32(0.5)) == 7
 
 
+def test_actions_that_are_corrected_in_place_become_demonstrations(demos: Path) -> None:
+    class Pushing(Person):
+        def correct(self, actions: NDArray[np.float32]) -> NDArray[np.float32] | None:
+            step, self.step = self.step, self.step + 1
+            if step in self.steps:
+                actions[:] = 0.5
+            return actions
+
+    run = train(demos, Pushing(3, 4, 5))
+    assert [line.steps for line in Demonstrations.open(run / "corrections").lines] == [3]
+
+
 def test_batches_draw_corrections_as_they_draw_demonstrations(demos: Path) -> None:
     class Watching(Person):
         def on_update(self, step: int, metrics: Any) -> None:

@@ -351,8 +351,6 @@ def test_resume_and_evaluate_refuse_an_environment_with_other_spaces(
         (["AdroitHandDoor-v1"], "package gymnasium-robotics"),
         (["AntMaze_UMaze-v4"], "package gymnasium-robotics"),
         (["PandaReach-v3"], "use the task panda_gym:PandaReach-v3"),
-        (["ALE/Pong-v5"], "use the task ale_py:ALE/Pong-v5"),
-        (["PongNoFrameskip-v4"], "package ale-py"),
         (["dm_control/cheetah-run-v0"], "pip install 'shimmy[dm-control]'"),
         (["os:getcwd"], "returned str"),
         (["./my_robot.py:make"], "use module:function, for example my_robot:make_env"),

@@ -95,7 +95,7 @@ class EpisodeRecording:
         self._actions: list[NDArray[np.float32]] = []
         self._intended: list[NDArray[np.float32]] = []
         self._rewards: list[float] = []
-        self._successes: list[bool] = []
+        self._successes: list[bool | None] = []
 
     def __len__(self) -> int:
         """Return the number of steps so far."""
@@ -122,20 +122,20 @@ class EpisodeRecording:
         self._actions.append(action)
         self._intended.append(intended)
         self._rewards.append(reward)
-        if "success" in info:
-            self._successes.append(bool(info["success"]))
+        self._successes.append(bool(info["success"]) if "success" in info else None)
 
     def finish(self, *, terminated: bool) -> Episode:
         """Return the episode, which has at least one step."""
         keys = self._observations[0]
+        told = [each for each in self._successes if each is not None]
         return Episode(
             {key: np.stack([each[key] for each in self._observations]) for key in keys},
             np.stack(self._actions),
             np.stack(self._intended),
             np.array(self._rewards, np.float32),
             terminated,
-            self._successes[-1] if self._successes else None,
-            np.array(self._successes) if len(self._successes) == len(self) else None,
+            bool(self._successes[-1]) if told else None,  # no report after others is a failure
+            np.array(told) if len(told) == len(self) else None,
         )
 
 

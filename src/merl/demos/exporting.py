@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import shutil
 from pathlib import Path
 from typing import Literal
 
 from merl.core import MerlError
+from merl.core.files import part_of, remove
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.lerobot_writer import write_lerobot
 from merl.demos.minari_data import write_minari
@@ -38,10 +37,10 @@ def export_demos(
         raise MerlError(f"{out} exists: name another with --out")
     if form == "lerobot" and rate is None:
         raise MerlError("LeRobotDataset needs the steps per second: give them with --rate")
-    part = out.with_name(f".{out.name}.part")
+    part = part_of(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        _remove(part)
+        remove(part)
         if form != "robomimic":
             part.mkdir()
         if form == "lerobot":
@@ -55,12 +54,4 @@ def export_demos(
     except OSError as error:
         raise MerlError(f"{out} cannot be written: {error.strerror or error}") from None
     finally:
-        _remove(part)
-
-
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        remove(part)

@@ -5,8 +5,7 @@ Nothing is written unless every episode fits.
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from merl.core import MerlError, counted, suggest
+from merl.core.files import part_of, remove, reporting
 from merl.core.user_code import in_one_line
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode, check_episode
@@ -43,6 +43,7 @@ class Target:
         observation_space, action_space: its spaces, in the form that agents use.
         bounds: lower and upper bounds of the actions in its own units; None if they are [-1, 1].
         rate: timesteps in a second; None if it is not known.
+        options: options of the task, if it is one of merl's.
     """
 
     task: str
@@ -50,6 +51,7 @@ class Target:
     action_space: spaces.Box
     bounds: tuple[list[float], list[float]] | None
     rate: float | None
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -114,31 +116,31 @@ def import_demos(source: Source, out: Path, target: Target, rules: Rules) -> Dem
         raise MerlError(f"{source.path} holds no episode")
     keys, out = matched(source, target, rules), out.absolute()
     check_free(out)
-    part = out.with_name(f".{out.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
+    part = part_of(out)
+    remove(part)
     made = f"{source.format} {source.path.name}"
     try:
-        recorder = Recorder(part, target.task, made, target.observation_space, target.action_space)
-        for raw in _read(source, tuple(dict.fromkeys(keys.values()))):
+        recorder = Recorder(
+            part,
+            target.task,
+            made,
+            target.observation_space,
+            target.action_space,
+            target.options,
+        )
+        for raw in source.episodes(tuple(dict.fromkeys(keys.values()))):
             recorder.add(converted(raw, source, keys, target, rules))
-        if out.exists():
-            out.rmdir()
-        part.replace(out)
-    except OSError as error:
-        raise MerlError(f"{out} cannot be written: {error.strerror}") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return Demonstrations.open(out)
-
-
-def _read(source: Source, keys: tuple[str, ...]) -> Iterator[RawEpisode]:
-    """Read the episodes of a source; whatever a package raises becomes one line."""
-    try:
-        yield from source.episodes(keys)
+        with reporting(f"{out} cannot be written"):
+            if out.exists():
+                out.rmdir()
+            part.replace(out)
     except MerlError:
         raise
-    except Exception as error:
+    except Exception as error:  # a package, or values of another kind than they say
         raise MerlError(f"{source.path} cannot be read: {in_one_line(error)}") from None
+    finally:
+        remove(part)
+    return Demonstrations.open(out)
 
 
 def matched(source: Source, target: Target, rules: Rules) -> dict[str, str]:
@@ -169,8 +171,12 @@ def matched(source: Source, target: Target, rules: Rules) -> dict[str, str]:
             f"{source.path}: an action has {counted(source.action_size, 'number')}, and "
             f"{target.task} takes {target.action_space.shape[0]}"
         )
-    known = source.rate is not None and target.rate is not None
-    if known and not rules.any_rate and not _same(source.rate, target.rate):
+    if (
+        source.rate is not None
+        and target.rate is not None
+        and not rules.any_rate
+        and not abs(source.rate / target.rate - 1.0) <= RATE_TOLERANCE  # NaN is no rate
+    ):
         raise MerlError(
             f"{source.path} has {source.rate:g} steps per second, and {target.task} has "
             f"{target.rate:g}: a step would mean another time; import them all the same with "
@@ -185,7 +191,8 @@ def converted(
     """Return an episode of a source as an episode of the environment.
 
     Without the observation after the last action, that before it is repeated. Without rewards, the
-    reward is 1 at the last step of an episode that does not end in failure, else 0.
+    reward is 1 at the last step of an episode that does not end in failure, which then ends by
+    termination unless the source says otherwise; else it is 0.
 
     Raises:
         MerlError: a value does not fit.
@@ -202,18 +209,20 @@ def converted(
         value = _fitted(f"{where}: {name!r}", value, space, resize=rules.resize)
         observations[key] = value if len(value) > steps else np.concatenate([value, value[-1:]])
     actions = _scaled(where, raw.actions, target, rules)
-    rewards = raw.rewards
+    rewards, terminated = raw.rewards, raw.terminated
     if rewards is None:
         rewards = np.zeros(steps, np.float32)
-        rewards[-1] = raw.success is not False
+        rewards[-1] = solved = raw.success is not False
+        terminated = solved if terminated is None else terminated
     intended = actions if raw.intended is None else _scaled(where, raw.intended, target, rules)
     episode = Episode(
         observations,
         actions,
         intended,
         rewards.astype(np.float32),
-        bool(raw.terminated),
+        bool(terminated),
         raw.success,
+        None if raw.successes is None else raw.successes.astype(bool),
     )
     check_episode(where, episode, target.observation_space, target.action_space)
     return episode
@@ -241,11 +250,6 @@ def _check_feature(
             return
         raise MerlError(f"{told}: resize its images with --resize")
     raise MerlError(f"{told}: name another with --keys {key}=FEATURE")
-
-
-def _same(one: float | None, two: float | None) -> bool:
-    """Return whether two rates are the same; NaN is none."""
-    return one is not None and two is not None and abs(one / two - 1.0) <= RATE_TOLERANCE
 
 
 def _flat(shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -20,7 +20,7 @@ from merl.core import MerlError
 from merl.core.files import check_kind, read_json, reporting
 from merl.demos.lerobot_frames import VideoFrames, decoded
 from merl.demos.packages import require
-from merl.demos.source import Feature, RawEpisode
+from merl.demos.source import Feature, RawEpisode, at_each_step
 
 VERSION = "v3."
 INFO = "meta/info.json"
@@ -94,17 +94,21 @@ class LeRobotDataset:
                 if key not in columns:
                     values[key] = self._frames(videos, key, row, length, name)
             flags = {
-                key: bool(values[key].reshape(-1)[-1]) if key in values else None
+                key: values[key].reshape(-1).astype(bool)
                 for key in (SUCCESS, TERMINATED)
+                if key in values
             }
+            ended = bool(flags[TERMINATED][-1]) if TERMINATED in flags else None
+            solved = flags.get(SUCCESS)
             yield RawEpisode(
                 name,
                 {key: values[key] for key in keys},
                 values[ACTION],
                 values.get(INTENDED),
                 values[REWARD].reshape(-1) if REWARD in values else None,
-                flags[TERMINATED],
-                flags[SUCCESS],
+                ended,
+                None if solved is None else bool(solved[-1]),
+                None if solved is None else at_each_step(solved, terminated=bool(ended)),
             )
 
     def _episodes(self) -> list[dict[str, Any]]:

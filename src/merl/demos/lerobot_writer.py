@@ -216,7 +216,8 @@ class _Writer:
         values |= {ACTION: episode.actions, INTENDED: episode.intended, REWARD: episode.rewards}
         values |= {DONE: last, TERMINATED: last & episode.terminated}
         if self.knows:
-            values[SUCCESS] = last & bool(episode.success)
+            known = episode.successes
+            values[SUCCESS] = last & bool(episode.success) if known is None else known
         numbers = np.arange(steps)
         values |= {
             "timestamp": numbers / self.rate,

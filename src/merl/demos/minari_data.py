@@ -11,10 +11,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.core import MerlError
-from merl.core.user_code import in_one_line
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.packages import require
-from merl.demos.source import Feature, RawEpisode
+from merl.demos.source import Feature, RawEpisode, at_each_step
 
 WHAT = "a dataset of Minari"
 SINGLE = "state"
@@ -36,12 +35,9 @@ class MinariData:
         from minari import MinariDataset
 
         self.path, self.format = path, "Minari"
-        try:
-            self._data = MinariDataset(path / "data")
-            observed, action = self._data.observation_space, self._data.action_space
-            self.count = int(self._data.total_episodes)
-        except Exception as error:  # the package raises what its storage raises
-            raise MerlError(f"{path} cannot be read: {in_one_line(error)}") from None
+        self._data = MinariDataset(path / "data")
+        observed, action = self._data.observation_space, self._data.action_space
+        self.count = int(self._data.total_episodes)
         if not isinstance(observed, spaces.Dict):
             observed = spaces.Dict({SINGLE: observed})
         if not isinstance(action, spaces.Box) or len(action.shape) != 1:
@@ -54,31 +50,26 @@ class MinariData:
             for key, space in observed.spaces.items()
             if isinstance(space, spaces.Box)
         }
-        spec = self._data.env_spec
-        rate = None if spec is None else (spec.kwargs or {}).get("render_fps")
-        self.rate: float | None = rate if isinstance(rate, int | float) else None
+        self.rate: float | None = None  # a dataset does not tell it
 
     def episodes(self, keys: tuple[str, ...]) -> Iterator[RawEpisode]:
         """Read the episodes with these features; see `Source`."""
-        try:
-            for episode in self._data.iterate_episodes():
-                observed = episode.observations
-                observed = observed if isinstance(observed, dict) else {SINGLE: observed}
-                infos: Any = episode.infos or {}
-                success = infos.get("success")
-                yield RawEpisode(
-                    f"episode {episode.id}",
-                    {key: np.asarray(observed[key]) for key in keys},
-                    np.asarray(episode.actions),
-                    _like(infos.get("intended_action"), episode.actions),
-                    np.asarray(episode.rewards),
-                    bool(episode.terminations[-1]),
-                    None if success is None else bool(np.asarray(success).reshape(-1)[-1]),
-                )
-        except MerlError:
-            raise
-        except Exception as error:
-            raise MerlError(f"{self.path} cannot be read: {in_one_line(error)}") from None
+        for episode in self._data.iterate_episodes():
+            observed = episode.observations
+            observed = observed if isinstance(observed, dict) else {SINGLE: observed}
+            infos: Any = episode.infos or {}
+            terminated = bool(episode.terminations[-1])
+            solved = _solved(infos.get("success"), len(episode.actions))
+            yield RawEpisode(
+                f"episode {episode.id}",
+                {key: np.asarray(observed[key]) for key in keys},
+                np.asarray(episode.actions),
+                _like(infos.get("intended_action"), episode.actions),
+                np.asarray(episode.rewards),
+                terminated,
+                None if solved is None else bool(solved[-1]),
+                None if solved is None else at_each_step(solved, terminated=terminated),
+            )
 
 
 def write_minari(demos: Demonstrations, out: Path) -> None:
@@ -104,12 +95,13 @@ def write_minari(demos: Demonstrations, out: Path) -> None:
         last = np.arange(steps) == steps - 1
         infos: dict[str, Any] = {"intended_action": _after_reset(episode.intended)}
         if episode.success is not None:
-            infos["success"] = _after_reset(last & episode.success)
+            known = episode.successes
+            infos["success"] = _after_reset(last & episode.success if known is None else known)
         storage.update_episodes(
             [
                 EpisodeBuffer(
                     id=index,
-                    observations={k: _plain(v) for k, v in episode.observations.items()},
+                    observations=dict(episode.observations),
                     actions=episode.actions,
                     rewards=episode.rewards.tolist(),
                     terminations=(last & episode.terminated).tolist(),
@@ -124,13 +116,15 @@ def write_minari(demos: Demonstrations, out: Path) -> None:
     )
 
 
-def _plain(value: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(value)
-
-
 def _after_reset(value: NDArray[Any]) -> NDArray[Any]:
     """Return values with one more at the front: Minari's infos begin with that of the reset."""
     return np.concatenate([np.zeros_like(value[:1]), value])
+
+
+def _solved(value: Any, steps: int) -> NDArray[np.bool_] | None:
+    """Return whether the episode was solved after each step; None if it is not told."""
+    flags = np.zeros(0) if value is None else np.asarray(value).reshape(-1)
+    return flags[-steps:].astype(bool) if len(flags) in (steps, steps + 1) else None
 
 
 def _like(value: Any, actions: Any) -> NDArray[Any] | None:

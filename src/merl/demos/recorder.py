@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -12,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from merl.core import MerlError
+from merl.core.files import reporting, replace_file
 from merl.demos.demonstrations import FORMAT, INDEX, KEY, Demonstrations, Line
 from merl.demos.episode import Episode
 from merl.runs.plain import describe
@@ -47,7 +49,8 @@ class Recorder:
             self.demonstrations = Demonstrations.open(path)
             self.demonstrations.check_fits(observation_space, action_space)
             return
-        check_free(path)
+        if not append:  # else an episode without its line in the index is written again
+            check_free(path)
         self.demonstrations = Demonstrations(
             path, task, source, observation_space, action_space, (), options or {}
         )
@@ -71,14 +74,12 @@ class Recorder:
         arrays |= {"reward": episode.rewards, "terminated": np.array(episode.terminated)}
         if episode.successes is not None:
             arrays["success"] = episode.successes
-        part = demos.path / f".{INDEX}.part"
-        try:
+        content = io.BytesIO()
+        np.savez_compressed(content, **arrays)
+        with reporting(f"{demos.path} cannot be written"):
             demos.path.mkdir(parents=True, exist_ok=True)
-            np.savez_compressed(demos.path / name, **arrays)
-            part.write_text(json.dumps(_index(whole), indent=1) + "\n")
-            part.replace(demos.path / INDEX)
-        except OSError as error:
-            raise MerlError(f"{demos.path} cannot be written: {error.strerror}") from None
+            replace_file(demos.path / name, content.getvalue())
+            replace_file(demos.path / INDEX, (json.dumps(_index(whole), indent=1) + "\n").encode())
         self.demonstrations = whole
 
 
@@ -88,14 +89,12 @@ def check_free(path: Path) -> None:
     Raises:
         MerlError: it holds files, or cannot be created.
     """
-    try:
+    with reporting(f"{path} cannot be created"):
         if not path.exists():
             path.mkdir(parents=True)
             path.rmdir()
         elif any(path.iterdir()):
             raise MerlError(f"{path} is not empty: name another folder")
-    except OSError as error:
-        raise MerlError(f"{path} cannot be created: {error.strerror}") from None
 
 
 def _index(demos: Demonstrations) -> dict[str, Any]:

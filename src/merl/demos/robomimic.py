@@ -16,8 +16,8 @@ from merl.demos.packages import require
 from merl.demos.source import Feature, RawEpisode
 
 WHAT = "robomimic's format"
-INTENDED = "intended_actions"
-"""A dataset of merl's: by it an exported file is imported as it was."""
+INTENDED, SUCCESSES = "intended_actions", "successes"
+"""Datasets of merl's: by them an exported file is imported as it was."""
 
 
 class RobomimicFile:
@@ -31,7 +31,8 @@ class RobomimicFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.format, self.rate = path, "robomimic HDF5", None
+        self.path, self.format = path, "robomimic HDF5"
+        self.rate: float | None = None
         with _opened(path) as file:
             data = _group(file, "data", path)
             self._names = sorted((str(name) for name in data), key=_number)
@@ -49,7 +50,7 @@ class RobomimicFile:
                 arguments = json.loads(data.attrs["env_args"])["env_kwargs"]
                 self.rate = float(arguments["control_freq"])
             except (KeyError, TypeError, ValueError):
-                self.rate = None
+                pass  # robomimic's own files do not tell it
         self.count = len(self._names)
 
     def episodes(self, keys: tuple[str, ...]) -> Iterator[RawEpisode]:
@@ -68,13 +69,21 @@ class RobomimicFile:
                 actions = _array(demo, "actions", self.path)
                 given = {
                     key: _array(demo, key, self.path) if key in demo else None
-                    for key in ("rewards", INTENDED)
+                    for key in ("rewards", INTENDED, SUCCESSES)
                 }
                 told = {
                     key: bool(demo.attrs[key]) if key in demo.attrs else None
                     for key in ("terminated", "success")
                 }
-                yield RawEpisode(name, values, actions, given[INTENDED], given["rewards"], **told)
+                yield RawEpisode(
+                    name,
+                    values,
+                    actions,
+                    given[INTENDED],
+                    given["rewards"],
+                    successes=given[SUCCESSES],
+                    **told,
+                )
 
 
 def write_robomimic(demos: Demonstrations, out: Path, rate: float | None) -> None:
@@ -104,6 +113,8 @@ def write_robomimic(demos: Demonstrations, out: Path, rate: float | None) -> Non
                 demo.attrs["success"] = episode.success
             demo["actions"], demo[INTENDED] = episode.actions, episode.intended
             demo["rewards"] = episode.rewards
+            if episode.successes is not None:
+                demo[SUCCESSES] = episode.successes
             demo["dones"] = (np.arange(steps) == steps - 1).astype(np.int64)
             for key, value in episode.observations.items():
                 demo.create_dataset(f"obs/{key}", data=value[:-1], compression="gzip")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 
@@ -44,6 +45,7 @@ class RawEpisode:
         rewards: (T,); None if the source has none.
         terminated: whether it ended by termination; None if the source does not say.
         success: whether it was solved at its end; None if the source does not say.
+        successes: whether it was solved after each step, (T,); None if the source does not say.
     """
 
     name: str
@@ -53,6 +55,20 @@ class RawEpisode:
     rewards: NDArray[Any] | None = None
     terminated: bool | None = None
     success: bool | None = None
+    successes: NDArray[Any] | None = None
+
+
+def at_each_step(flags: NDArray[np.bool_], *, terminated: bool) -> NDArray[np.bool_] | None:
+    """Return whether an episode was solved after each step; None if the flags tell only its end.
+
+    Many sources set the flag at the last step alone, however long the task has been solved before.
+
+    Args:
+        flags: the source's flag at each step, (T,).
+        terminated: whether the episode ended by termination.
+    """
+    only_last = bool(flags[-1]) and len(flags) > 1 and not flags[:-1].any()
+    return None if only_last and not terminated else flags
 
 
 class Source(Protocol):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from merl.core import Kind, MerlError
 from merl.core.choices import HandStart, ProprioSet, RewardForm, StateSet
@@ -89,6 +89,11 @@ class EnvConfig:
                 f"samples is {self.samples}, and renderer {self.renderer!r} takes one sample per "
                 "pixel: use renderer raster, or samples 1"
             )
+
+    @property
+    def form(self) -> dict[str, Any]:
+        """What demonstrations record of a task of merl's: its reward, starts and disc."""
+        return {name: getattr(self, name) for name in ("reward", "start", "occluded")}
 
 
 @dataclass(frozen=True)

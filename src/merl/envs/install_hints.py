@@ -29,8 +29,6 @@ PACKAGES = (
     Package("gym-aloha", "gym_aloha", "gym_aloha/"),
     Package("gym-xarm", "gym_xarm", "gym_xarm/"),
     Package("shimmy[dm-control]", "shimmy", "dm_control/"),
-    Package("ale-py", "ale_py", r"ALE/|\w+NoFrameskip-v|\w+Deterministic-v"),
-    Package("minigrid", "minigrid", "MiniGrid-|BabyAI-"),
     Package(
         "highway-env", "highway_env", "(highway|merge|roundabout|parking|intersection|racetrack)-"
     ),

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from merl.core import MerlError
+from merl.core.user_code import in_one_line
 
 if TYPE_CHECKING:
     from merl.networks.success_classifier import SuccessNetwork
@@ -26,7 +27,7 @@ def load_classifier(file: Path) -> tuple[SuccessNetwork, dict[str, tuple[int, ..
         MerlError: it cannot be read.
     """
     import torch
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
     from merl.networks.success_classifier import SuccessNetwork
 
@@ -39,9 +40,10 @@ def load_classifier(file: Path) -> tuple[SuccessNetwork, dict[str, tuple[int, ..
         with torch.no_grad():  # gives the lazy layers their sizes
             network({key: torch.zeros((1, *shape)) for key, shape in shapes.items()})
         network.load_state_dict(weights)
-    except (OSError, SafetensorError, LookupError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise MerlError(f"{file} is not a classifier that can be read: {reason}") from None
+    except Exception as error:  # the file may come from anyone
+        raise MerlError(
+            f"{file} is not a classifier that can be read: {in_one_line(error)}"
+        ) from None
     return network.eval(), shapes
 
 

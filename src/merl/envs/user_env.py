@@ -21,7 +21,7 @@ from merl.core.user_code import in_one_line
 from merl.envs.config import UserEnvConfig
 from merl.envs.install_hints import installing
 from merl.envs.registration import ENV_IDS
-from merl.envs.wrappers import adapt, failing
+from merl.envs.wrappers import adapt, close_env, failing
 
 BUNDLED = ("merl.envs.dot:whole", "merl.envs.dot:split")
 """Tasks in the form module:function that are part of merl."""
@@ -57,15 +57,16 @@ def make_user_env(
         MerlError: there is no such environment, or agents cannot learn in it.
     """
     env = _make(task, render_mode, make)
-    if render_mode is not None and not _renders(env):
-        env.close()
+    # One that does not render is kept: making it again would move a robot again.
+    if env.render_mode is not None and not _renders(env):
+        close_env(env)
         env = _make(task, None, make)
     if env.has_wrapper_attr("own_bounds"):
         return env  # it has that form already
     try:
         return adapt(env, config)
     except BaseException:
-        env.close()
+        close_env(env)
         raise
 
 
@@ -172,15 +173,13 @@ def _call_function(task: str, make: Any, render_mode: str | None) -> Any:
         with failing(f"function {task.partition(':')[2] or task}"):
             return make(**given)
     except MerlError:
-        if render_mode is None:
+        if given.get("render_mode") is None:
             raise
         return _call_function(task, make, None)  # it may not support this render mode
 
 
 def _renders(env: gymnasium.Env[Any, Any]) -> bool:
     """Return whether the environment renders; packages for rendering may be missing."""
-    if env.render_mode is None:
-        return False
     try:
         with failing("render"):
             env.reset(seed=0)

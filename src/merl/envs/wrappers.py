@@ -139,11 +139,7 @@ class Adapted(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def close(self) -> None:
         """Close the environment; if that fails, warn and continue."""
-        try:
-            with failing("close"):
-                self.env.close()
-        except MerlError as error:
-            _LOG.warning("%s", error)
+        close_env(self.env)
 
     def _scaled(self, action: NDArray[np.float32]) -> NDArray[Any]:
         """Rescale an action from [-1, 1] to the environment's bounds, never beyond them."""
@@ -182,6 +178,15 @@ def _plain_key(space: spaces.Space[Any]) -> str:
     if isinstance(space, spaces.Box) and is_depth(space):
         return "depth"
     return "image" if space.dtype == np.uint8 else "history"
+
+
+def close_env(env: gymnasium.Env[Any, Any]) -> None:
+    """Close a user's environment; if that fails, warn and continue."""
+    try:
+        with failing("close"):
+            env.close()
+    except MerlError as error:
+        _LOG.warning("%s", error)
 
 
 @contextmanager

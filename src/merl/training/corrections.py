@@ -75,8 +75,7 @@ class Corrections:
                 "add to: name a folder of them with --demos (`merl demos record` makes one)"
             )
         config = setup.config
-        names = () if config.has_user_env else ("reward", "start", "occluded")
-        options = {name: getattr(config.env, name) for name in names}
+        options = {} if config.has_user_env else config.env.form
         spaces = setup.space, setup.action_space
         folder = run.path / FOLDER
         recorder = Recorder(folder, config.task, "corrections", *spaces, options, append=True)
@@ -93,7 +92,7 @@ class Corrections:
 
     def apply(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the actions (N, A) to execute, and begin or end stretches of corrected steps."""
-        executed = self._correct(actions)
+        executed = self._correct(actions.copy())  # it may change them in place
         changed = np.flatnonzero((executed != actions).any(axis=1)).tolist()
         self._actions = {index: executed[index] for index in changed}
         for index in self._open.keys() - self._actions.keys():

@@ -247,11 +247,16 @@ def load_demos(
             f"{found.path} holds demonstrations of {found.task}, not of {config.task}: name others "
             "with --demos"
         )
-    form = {} if config.has_user_env else {"reward": config.env.reward}
-    for name, value in form.items():
+    if config.action_repeat > 1:
+        raise MerlError(
+            f"action-repeat {config.action_repeat} does not fit demonstrations, which have an "
+            "action for every step: use --action-repeat 1"
+        )
+    for name in () if config.has_user_env else ("reward", "occluded"):
+        value = config.env.form[name]
         if found.options.get(name, value) != value:
             raise MerlError(
-                f"{found.path} was recorded with --{name} {found.options[name]}, and the run has "
+                f"{found.path} was recorded with {name} {found.options[name]}, and the run has "
                 f"{value}: their rewards do not mix"
             )
     loaded = found.load(config.replay, space, action_space)  # this checks the files

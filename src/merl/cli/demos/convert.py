@@ -19,7 +19,6 @@ from merl.core.fields import Range, check_fields
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.exporting import Format, export_demos
 from merl.demos.importing import Actions, Rules, Target, import_demos, open_source
-from merl.envs import make_env
 from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.envs.frame_rate import frame_rate
 from merl.envs.registration import ENV_IDS
@@ -72,7 +71,8 @@ def import_(args: list[str]) -> int:
     options, preset = with_env(ImportOptions, "import", args)
     if options.source is None:
         raise MerlError("merl demos import needs the folder or file to convert: --from PATH")
-    source = open_source(options.source)
+    # The environment may change the working folder.
+    source, folder = open_source(options.source.absolute()), options.folder.absolute()
     with ExitStack() as stack:
         made = make(options, stack)
         assert isinstance(made.observation_space, spaces.Dict)
@@ -87,11 +87,12 @@ def import_(args: list[str]) -> int:
             made.action_space,
             own_bounds(made),
             frame_rate(made.metadata),
+            options.env.form if options.task in ENV_IDS else {},
         )
     rules = Rules(options.keys, options.actions, options.clip, options.resize, options.any_rate)
     console = make_console()
     with console.status("importing", spinner="line"):
-        found = import_demos(source, options.folder, target, rules)
+        found = import_demos(source, folder, target, rules)
     describe(console, found)
     names = [key for key, feature in source.features.items() if feature.lossy]
     if names:
@@ -109,9 +110,9 @@ def export(args: list[str]) -> int:
     found = Demonstrations.open(options.folder)
     rate = options.rate
     if rate is None and found.task in ENV_IDS:
-        made = make_env(found.task, observations=("proprio",))
-        rate = frame_rate(made.metadata)
-        made.close()
+        from merl.envs.arm_env import ArmEnv  # imports dm_control
+
+        rate = frame_rate(ArmEnv.metadata)
     ending = ".hdf5" if options.to == "robomimic" else f"-{options.to}"
     folder = options.folder.absolute()
     out = options.out or folder.with_name(folder.name + ending)

@@ -68,6 +68,7 @@ def record(args: list[str]) -> int:
             "or record episodes of your own with Python (docs/howto/demonstrations.md)"
         )
     console = make_console()
+    folder = options.folder.absolute()  # the environment may change the working folder
     with ExitStack() as stack:
         by_hand = options.source in DEVICES
         made = make(options, stack, render_mode="rgb_array" if by_hand else None)
@@ -75,10 +76,9 @@ def record(args: list[str]) -> int:
             source, found = options.source, _by_hand(options, made, stack)
         else:
             source, found = _by_policy(options, made)
-        names = ("reward", "start", "occluded") if options.task in ENV_IDS else ()
-        form = {name: getattr(options.env, name) for name in names}
+        form = options.env.form if options.task in ENV_IDS else {}
         spaces = made.observation_space, made.action_space
-        recorder = Recorder(options.folder, options.task, source, *spaces, form)
+        recorder = Recorder(folder, options.task, source, *spaces, form)
         with console.status("recording", spinner="line"):
             for episode in found:
                 recorder.add(episode)

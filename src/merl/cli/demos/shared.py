@@ -13,15 +13,15 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
+from merl.acting.instances import EnvRecipe
 from merl.cli.parsing import parse
 from merl.core import check_choice, counted
 from merl.core.fields import check_fields
 from merl.core.statistics import bootstrap_interval
 from merl.demos.demonstrations import Demonstrations
-from merl.envs import make_env
 from merl.envs.config import EnvConfig
 from merl.envs.registration import ENV_IDS
-from merl.envs.user_env import make_user_env
+from merl.envs.user_env import load_module
 from merl.experiments.experiment import flags
 from merl.experiments.presets import PRESETS, compose, default_preset
 
@@ -77,11 +77,10 @@ def with_env(kind: type[Any], action: str, args: list[str]) -> tuple[Any, str]:
 
 def make(options: Any, stack: ExitStack, render_mode: str | None = None) -> Any:
     """Make the environment of demonstrations, which closes with the stack."""
-    if options.task in ENV_IDS:
-        settings = {f.name: getattr(options.env, f.name) for f in dataclasses.fields(EnvConfig)}
-        made: Any = make_env(options.task, render_mode=render_mode, **settings)
-    else:
-        made = make_user_env(options.task, config=options.user_env, render_mode=render_mode)
+    if ":" in options.task:
+        load_module(options.task, Path.cwd())
+    recipe = EnvRecipe(options.task, options.env, options.user_env, action_repeat=1)
+    made = recipe.instance(render_mode)
     stack.callback(made.close)
     return made
 

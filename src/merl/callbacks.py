@@ -97,10 +97,10 @@ class CallbackList(Callback):
         for callback in self._callbacks:
             try:
                 corrected = callback.correct(actions)
+                actions = actions if corrected is None else _checked(corrected, actions.shape)
             except Exception as error:
                 name = f"{type(callback).__name__}.correct"
                 raise CallbackFailed(f"callback {name} raised {in_one_line(error)}") from error
-            actions = actions if corrected is None else _checked(callback, corrected, actions.shape)
         return actions
 
     def _notify(self, event: str, *args: Any) -> bool:
@@ -121,17 +121,18 @@ class CallbackList(Callback):
         return goes_on
 
 
-def _checked(callback: Callback, actions: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Return corrected actions as float32.
 
     Raises:
-        MerlError: they have another shape, or a value is not a number in [-1, 1].
+        ValueError: they have another shape, or a value is not a number in [-1, 1].
     """
     found = np.asarray(actions, np.float32)
-    if found.shape != shape or not (np.abs(found) <= 1.0).all():
-        raise MerlError(
-            f"{type(callback).__name__}.correct returned an array of shape {found.shape} from "
-            f"{found.min():g} to {found.max():g}: return None, or {shape} numbers in "
-            "[-1, 1]"
+    if found.shape != shape:
+        raise ValueError(f"it returned an array of shape {found.shape}: return None, or {shape}")
+    if not (np.abs(found) <= 1.0).all():
+        raise ValueError(
+            f"it returned numbers from {found.min():g} to {found.max():g}: return None, or numbers "
+            "in [-1, 1]"
         )
     return found

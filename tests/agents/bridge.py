@@ -14,6 +14,7 @@ from gymnasium import spaces
 from torch import Tensor, nn
 
 from merl.agents import make_agent
+from merl.agents.bc import BCConfig
 from merl.agents.config import AgentConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.sac import SACConfig
@@ -84,7 +85,7 @@ class Case:
     def agent(self, seed: int = 0, actions: int = ACTIONS) -> DDPG:
         """Make the agent with the package."""
         return make_agent(
-            "sac" if isinstance(self.config, SACConfig) else "merl",
+            {SACConfig: "sac", BCConfig: "bc"}.get(type(self.config), "merl"),
             self.config,
             self.observation_space,
             spaces.Box(-1, 1, (actions,), np.float32),

@@ -8,6 +8,7 @@ import pytest
 import torch
 from bridge import Case, double, draws_of, named, snapshot, weather, weights_of
 
+from merl.agents.bc import BCConfig
 from merl.agents.ddpg import DDPG
 from merl.agents.merl import MERLConfig
 
@@ -55,6 +56,32 @@ def same(before: list, after: list) -> bool:
     return all(
         torch.equal(p, q) and ((g is None and h is None) or torch.equal(g, h))
         for (p, g), (q, h) in zip(before, after, strict=True)
+    )
+
+
+@pytest.mark.parametrize("fusion", ["decoupled", "shared", "shared_by_both"])
+def test_cloning_trains_the_fusion_that_the_actor_uses(fusion: str) -> None:
+    agent = replace(CASE, config=BCConfig(**{**vars(CONFIG), "fusion": fusion})).agent()
+    trained = [id(p) for p in agent.actor_parameters]
+    used = [*agent.networks.fusion_of_actor().parameters(), *agent.networks.actor.parameters()]
+    assert {id(p) for p in used} <= {*trained}
+    assert len(trained) == len({*trained})
+
+
+@BOTH_TARGETS
+@pytest.mark.parametrize("fusion", ["decoupled", "shared"])
+def test_a_cloned_policy_is_that_of_the_targets_too(fusion: str, target: str) -> None:
+    config = replace(CONFIG, fusion=fusion, target=target)
+    first, second = (replace(CASE, config=config).agent() for _ in range(2))
+    weather(second)
+    first.take_policy(second)
+    if target == "heads_and_fusion":
+        kept = first.critic_target["critic_fusion"].state_dict()
+        for name, value in first.networks.critic_fusion.state_dict().items():
+            assert torch.equal(kept[name], value)
+    assert torch.equal(
+        first.networks.actor.state_dict()["layers.0.linear.weight"],
+        second.networks.actor.state_dict()["layers.0.linear.weight"],
     )
 
 

@@ -6,9 +6,11 @@ import socket
 import threading
 from pathlib import Path
 
+import pytest
 from test_spool import LAYOUT, fill
 
 from helpers import wait_for
+from merl.core import MerlError
 from merl.link.connection import Connection
 from merl.link.protocol import Address, Channel
 from merl.link.spool import Spool
@@ -38,3 +40,22 @@ def test_timesteps_stay_until_a_checkpoint_holds_them(tmp_path: Path) -> None:
         thread.join(60)
         assert (spool.first, spool.last) == (6, 9)
         learner.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [
+        ("10.0.0.7:9", "10.0.0.7", 9),
+        ("arm", "arm", 7007),
+        ("::1", "::1", 7007),
+        ("[::1]", "::1", 7007),
+        ("[::1]:9", "::1", 9),
+    ],
+)
+def test_addresses(text: str, host: str, port: int) -> None:
+    assert Address.parse(text, "--connect") == (host, port)
+
+
+def test_an_address_without_a_port_in_range_is_refused() -> None:
+    with pytest.raises(MerlError, match="--connect takes HOST:PORT"):
+        Address.parse("arm:70000", "--connect")

@@ -9,7 +9,9 @@ import torch
 
 from merl.agents.config import AgentConfig
 from merl.agents.sac import SACConfig
+from merl.config import override
 from merl.core import MerlError
+from merl.experiments.presets import compose
 from merl.networks.returns import HLGauss
 from merl.training.setup import bounded
 
@@ -82,13 +84,18 @@ def test_initial_values_are_near_zero_or_the_nearer_bound(low: float) -> None:
 
 
 def test_discount_sets_the_highest_return() -> None:
-    config = AgentConfig(critic_loss="hl_gauss")
-    assert bounded(config, 0.95).critic_high == 20.0
-    assert bounded(AgentConfig(), 0.95).critic_high is None
+    run = compose("smoke", "reach_duplo")
+    other = override(run, {"replay.discount": 0.95})
+    endless = override(run, {"replay.discount": 1.0})
+    histogram = AgentConfig(critic_loss="hl_gauss")
+    assert bounded(histogram, other).critic_high == 20.0
+    # An action of two steps gets both rewards.
+    assert bounded(histogram, override(other, {"action_repeat": 2})).critic_high == 40.0
+    assert bounded(AgentConfig(), other).critic_high is None
     chosen = AgentConfig(critic_loss="hl_gauss", critic_high=7.0)
-    assert bounded(chosen, 1.0).critic_high == 7.0
+    assert bounded(chosen, endless).critic_high == 7.0
     with pytest.raises(MerlError, match=r"discount 1 returns have .* set --agent.critic-high"):
-        bounded(config, 1.0)
+        bounded(histogram, endless)
 
 
 @pytest.mark.parametrize(

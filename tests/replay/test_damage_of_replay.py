@@ -120,6 +120,31 @@ def test_the_checkpoint_before_the_last_is_restored_exactly(tmp_path: Path, comp
         del replay
 
 
+@pytest.mark.parametrize("compress", [False, True])
+def test_a_replay_that_grew_is_not_damaged(tmp_path: Path, compress: bool) -> None:
+    """The run dies after the growth, which lays compressed frames out anew, before it saves."""
+    replay = make(tmp_path, compress=compress)
+    play(replay, 0, 140)
+    state, expected = saved(replay), timesteps_of(replay, 139)
+    for capacity in (100, 200):
+        replay = make(tmp_path, compress=compress, capacity=capacity)
+        assert find_damage(tmp_path, replay.spec, state) == []
+        replay.load_state_dict(state)
+        assert timesteps_of(replay, 139) == expected
+    play(replay, 140, 28)
+    assert find_damage(tmp_path, replay.spec, saved(replay)) == []
+
+
+def test_spans_that_do_not_fit_their_file_are_damage(tmp_path: Path) -> None:
+    replay = make(tmp_path)
+    play(replay, 0, 40)
+    state = saved(replay)
+    for value in (-1, 2**40, 2**62):
+        replay.arrays["observation.image.span"][3, 1] = value
+        found = find_damage(tmp_path, replay.spec, state)
+        assert [each.field for each in found] == ["observation.image.span"]
+
+
 def test_a_replay_without_checksums_loads_as_before(tmp_path: Path) -> None:
     replay = make(tmp_path)
     play(replay, 0, 40)

@@ -31,8 +31,12 @@ class BC(DDPG):
 
     def __init__(self, config: BCConfig, *spaces: Any, **options: Any) -> None:
         super().__init__(config, *spaces, **options)
-        encoders = (p for p in self.networks.encoders.parameters() if p.requires_grad)
-        self.actor_parameters = [*encoders, *self.actor_parameters]
+        networks = self.networks
+        self.actor_parameters = [
+            *(p for p in networks.encoders.parameters() if p.requires_grad),
+            *networks.fusion_of_actor().parameters(),  # also one shared with the critic
+            *networks.actor.parameters(),
+        ]
         self.actor_optimizer = adam(self.actor_parameters, config.learning_rate)
 
     @with_torch_settings

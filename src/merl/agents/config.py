@@ -91,8 +91,8 @@ class AgentConfig(ObservationConfig):
     """Lowest return of the histogram, in units of reward. Lower targets are clipped to it: set it
     if rewards can be below 0."""
     critic_high: float | None = None
-    """Highest return of the histogram; if not set, 1 / (1 - discount), the bound for rewards in
-    [0, 1]. Higher targets are clipped to it: set it if rewards can be above 1."""
+    """Highest return of the histogram; if not set, action_repeat / (1 - discount), the bound for
+    rewards in [0, 1]. Higher targets are clipped to it: set it if rewards can be above 1."""
     actor_average: Share | None = None
     """Evaluate and deploy an exponential moving average of the actor and its fusion. This is the
     weight of the newest weights at each update, in (0, 1], e.g. 0.001; if not set, there is no

@@ -306,6 +306,13 @@ class DDPG:
         """Restore the networks from `state_dict()`."""
         self.networks.load_state_dict(weights["networks"])
 
+    def take_policy(self, other: DDPG) -> None:
+        """Start with the policy of another agent; see `Networks.take_policy`."""
+        self.networks.take_policy(other.networks)
+        if "critic_fusion" in self.critic_target:  # which the actor may share
+            fusion = self.networks.critic_fusion.state_dict()
+            self.critic_target["critic_fusion"].load_state_dict(fusion)
+
     # ----------------------------------------------------------------------------------------
 
     def _actors_fusion(self) -> Iterator[nn.Parameter]:

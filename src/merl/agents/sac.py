@@ -38,6 +38,7 @@ class SACConfig(DDPGConfig):
     noise_std_end: Annotated[float | None, tyro.conf.Suppress] = None
     noise_steps: Annotated[int, tyro.conf.Suppress] = 1
     noise_clip: Annotated[float, tyro.conf.Suppress] = 0.0
+    noise_correlation: Annotated[float, tyro.conf.Suppress] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

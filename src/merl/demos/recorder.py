@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from merl.core import MerlError
-from merl.core.files import reporting, replace_file
+from merl.core.files import replace_file, reporting
 from merl.demos.demonstrations import FORMAT, INDEX, KEY, Demonstrations, Line
 from merl.demos.episode import Episode
 from merl.runs.plain import describe

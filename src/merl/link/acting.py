@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -212,8 +213,11 @@ class Actor:
         """Wait for weights, and until the learner is near; return False if it is time to stop."""
         while not self._ends():
             self._load()
-            if self._connection.wait(behind, _POLL) and self._loaded:
+            near = self._connection.wait(behind, _POLL)
+            if near and self._loaded:
                 return not self._ends()
+            if near:  # the first weights are on their way
+                time.sleep(_POLL)
         return False
 
     def _load(self) -> None:

@@ -47,13 +47,13 @@ class Address(NamedTuple):
 
     @classmethod
     def parse(cls, text: str, flag: str) -> Address:
-        """Parse HOST:PORT, or HOST alone.
+        """Parse HOST:PORT, or HOST alone; an IPv6 address with a port needs brackets.
 
         Raises:
             MerlError: it is neither; the message names the flag.
         """
         host, colon, port = text.rpartition(":")
-        if not colon or text.endswith("]"):
+        if not colon or text.endswith("]") or (text.count(":") > 1 and "]" not in text):
             host, port = text, str(PORT)
         if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
             raise MerlError(f"{flag} takes HOST:PORT, for example 127.0.0.1:{PORT}, not {text!r}")
@@ -77,7 +77,7 @@ def read_token(file: Path | None) -> bytes:
     if file is None:
         return os.environ.get(TOKEN, "").strip().encode()
     try:
-        token = file.read_bytes().strip()
+        token = Path(file).read_bytes().strip()
     except OSError as error:
         raise MerlError(f"token {file} cannot be read: {error.strerror}") from None
     if not token:
@@ -194,7 +194,7 @@ def greet_actor(channel: Channel, token: bytes) -> None:
     channel.send({"merl": merl.__version__, "nonce": nonce})
     answer, _ = channel.receive(_UNKNOWN)
     nonces = nonce + str(answer.get("nonce"))
-    if not hmac.compare_digest(_proof(token, "actor", nonces), str(answer.get("proof"))):
+    if not _same(_proof(token, "actor", nonces), answer.get("proof")):
         refusal = f"the token is not the learner's: give both the same file, or the same {TOKEN}"
         channel.send({"error": refusal})
         raise MerlError(f"an actor at {channel.peer} has another token")
@@ -219,8 +219,13 @@ def greet_learner(channel: Channel, token: bytes) -> None:
     nonces = str(greeting.get("nonce")) + nonce
     channel.send({"nonce": nonce, "proof": _proof(token, "actor", nonces)})
     answer, _ = channel.receive(_UNKNOWN)
-    if not hmac.compare_digest(_proof(token, "learner", nonces), str(answer.get("proof"))):
+    if not _same(_proof(token, "learner", nonces), answer.get("proof")):
         raise MerlError(f"what answers at {channel.peer} does not know the token: it is no learner")
+
+
+def _same(proof: str, given: Any) -> bool:
+    """Compare a proof with what the other side has sent, in a time that tells nothing of it."""
+    return hmac.compare_digest(proof.encode(), str(given).encode())
 
 
 def _proof(token: bytes, side: str, nonces: str) -> str:

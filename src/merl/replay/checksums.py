@@ -58,6 +58,13 @@ class RingData:
         """Return the slots of timesteps in the arrays of all rings."""
         return self.number * self.slots + (timesteps - 1) % self.slots
 
+    def spans_fit(self, name: str, span: str, first: int, last: int) -> bool:
+        """Return whether the spans of a field of compressed frames lie within its file."""
+        size = self.arrays[name].size
+        spans = self.arrays[span][self.rows(np.arange(first, last + 1))]
+        in_file = bool(((spans >= 0) & (spans <= size)).all())
+        return in_file and spans.sum(axis=1).max() <= size and spans[:, 1].sum() <= size
+
     def parts(self, name: str, first: int, last: int) -> Iterator[NDArray[Any]]:
         """Yield the bytes of a field from timestep `first` to `last` in contiguous parts."""
         spans = {field_name(key): span_name(key) for key in self.spec.compressed}
@@ -131,14 +138,15 @@ class Checksums:
         for index, (first, last) in enumerate(ranges(covered["oldest"], covered["newest"])):
             if first <= after:
                 continue
-            found = {
-                name
-                for name in self._data.arrays
-                if name not in spans and self._add(name, first, last, 0) != sums[name][index]
-            }
-            for name, span in spans.items():  # without its span, a frame is not found
-                if span not in found and self._add(name, first, last, 0) != sums[name][index]:
-                    found.add(name)
+            differ = lambda name: self._add(name, first, last, 0) != sums[name][index]  # noqa: B023, E731
+            others = self._data.arrays.keys() - {*spans, *spans.values()}
+            found = {name for name in others if differ(name)}
+            # Right frames have right spans: where they lie changes when the replay grows.
+            for name, span in spans.items():
+                if not self._data.spans_fit(name, span, first, last):
+                    found.add(span)
+                elif differ(name):
+                    found.add(span if differ(span) else name)
             yield from ((name, first, last) for name in sorted(found))
 
     def _add(self, name: str, first: int, last: int, sum_: int) -> int:

@@ -158,7 +158,9 @@ class EpisodeRing:
             self._leave_out(covered, damage)
         if timesteps == 0 or self._data["timestep"][self._slot(timesteps)] == timesteps:
             oldest = covered["oldest"] if covered else 1
-            self._rebuild(timesteps, int(state["steps"]), bool(state["open"]), oldest)
+            # The rest of an episode that was left out would begin with a damaged observation.
+            is_open = bool(state["open"]) and not damage
+            self._rebuild(timesteps, int(state["steps"]), is_open, oldest)
             self._confirmed = timesteps
             if covered is not None and not damage:
                 self._continue(covered)

@@ -30,7 +30,7 @@ def load_initial_weights(agent: Agent, home: Path) -> None:
     try:
         if not isinstance(other, DDPG):
             raise RuntimeError("it is the policy of an agent of another kind")
-        agent.networks.take_policy(other.networks)
+        agent.take_policy(other)
     except RuntimeError as error:
         first = str(error).split(":\n", 1)[-1].strip().splitlines()[0]
         raise MerlError(

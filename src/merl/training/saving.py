@@ -77,17 +77,17 @@ class Saver:
             return True
         last = self._evaluations.last
         fresh = last is not None and progress.evaluated == progress.step
-        state = {
-            "progress": dataclasses.asdict(progress),
-            "randomness": setup.randomness.state_dict(),
-            "replay": self._replay.state_dict() | self._replay.checksums(),
-            "environment": self._environment_states(),
-            "seconds": self._clock.seconds(),
-            "cpu_seconds": self._clock.cpu_seconds(),
-            "env": to_plain(setup.config.env),
-        }
         try:
-            self._replay.flush()
+            self._replay.flush()  # if it writes the files again, the checksums change
+            state = {
+                "progress": dataclasses.asdict(progress),
+                "randomness": setup.randomness.state_dict(),
+                "replay": self._replay.state_dict() | self._replay.checksums(),
+                "environment": self._environment_states(),
+                "seconds": self._clock.seconds(),
+                "cpu_seconds": self._clock.cpu_seconds(),
+                "env": to_plain(setup.config.env),
+            }
             checkpoint.save(
                 self._run.checkpoints,
                 progress.step,

@@ -78,7 +78,7 @@ class Setup:
         self.spec = run_spec(config, env)
         self.space, self.action_space = run_spaces(config, env)
         self.device = choose_device(config.device)
-        bounded(config.agent, config.replay.discount)  # reject bad values before timing
+        bounded(config.agent, config)  # reject bad values before timing
         check_memory(config, self.space, self.action_space)
         keep_freed_memory()
         # Without evaluations there are no videos: do not time their frames.
@@ -94,7 +94,7 @@ class Setup:
             config,
             threads=best.threads,
             device=device_name(config.device),
-            agent=bounded(best.decided(config.agent), config.replay.discount),
+            agent=bounded(best.decided(config.agent), config),
         )
         self.progress, self.randomness = Progress(), Randomness(config.seed)
         self.agent: Agent = make_agent(
@@ -200,13 +200,16 @@ class Setup:
             yield cls(config, env, eval_env, home, replay_spec, make)
 
 
-def bounded(agent: ObservationConfig, discount: float) -> ObservationConfig:
-    """Return the config with a value of `critic_high`, if its critic predicts a histogram.
+def bounded(agent: ObservationConfig, config: TrainConfig) -> ObservationConfig:
+    """Return an agent's config with a value of `critic_high`, if its critic predicts a histogram.
+
+    Rewards of merl's tasks are at most 1 a step; an action may take several.
 
     Raises:
         MerlError: the discount gives no bound of the returns, or one that is not above
             `critic_low`.
     """
+    discount = config.replay.discount
     if not isinstance(agent, AgentConfig):
         return agent
     if agent.critic_loss == "mse" or agent.critic_high is not None:
@@ -216,7 +219,7 @@ def bounded(agent: ObservationConfig, discount: float) -> ObservationConfig:
             "with replay.discount 1 returns have no upper bound, but agent.critic-loss "
             f"{agent.critic_loss} needs one: set --agent.critic-high"
         )
-    high = round(1.0 / (1.0 - discount), 6)  # 100, not 99.99999999999991
+    high = round(config.action_repeat / (1.0 - discount), 6)  # 100, not 99.99999999999991
     return dataclasses.replace(agent, critic_high=high)
 
 

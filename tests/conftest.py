@@ -12,7 +12,7 @@ import torch
 
 from merl.core import MerlError
 from merl.core.watcher import ENDING
-from merl.rendering.renderer import check_renderer
+from merl.rendering.opengl import enable_opengl
 
 # Environment of the processes that tests start: they share the cores with other tests, and their
 # output must not depend on the terminal.
@@ -64,7 +64,7 @@ def _one_thread() -> Iterator[None]:
 def opengl() -> None:
     """Skip a test on a machine without OpenGL."""
     try:
-        check_renderer("gl")
+        enable_opengl()
     except MerlError:
         pytest.skip("no OpenGL library works on this machine")
 

@@ -23,12 +23,6 @@ from toy import DotEnv
 SMALL = EnvConfig(renderer="raster", image_size=32)
 
 
-def test_recorded_config_names_the_renderer_that_draws() -> None:
-    plain = to_plain(TrainConfig("reach_duplo", env=EnvConfig()))["env"]
-    assert plain["renderer"] == "raster"
-    assert from_plain(EnvConfig, plain | {"renderer": "auto"}).renderer == "raster"
-
-
 def test_samples_are_recorded_and_older_records_have_one() -> None:
     env = EnvConfig(renderer="raster", image_size=24, samples=3)
     plain = to_plain(TrainConfig("reach_duplo", env=env))["env"]

@@ -29,10 +29,10 @@ def test_every_variant_is_timed():
 
 
 def test_dm_control_is_skipped_without_opengl(monkeypatch):
-    def missing(_):
+    def missing():
         raise MerlError("no OpenGL here")
 
-    monkeypatch.setattr(bench, "check_renderer", missing)
+    monkeypatch.setattr(bench, "enable_opengl", missing)
     result = bench.run(repeats=1, steps=2, image_size=16)
     assert "ratio" not in result
     assert bench.THEIRS not in result["steps_per_s"]

@@ -191,14 +191,6 @@ def test_evaluating_with_gl_uses_one_sample(run: Path, monkeypatch: pytest.Monke
     assert made == [{"renderer": "gl", "samples": 1}, {"renderer": "raster"}]
 
 
-def test_renderer_auto_is_that_of_training(run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    policy = merl.load_policy(run)
-    env = policy.make_env(renderer="auto", observations=("proprio",))
-    assert env.unwrapped.config.renderer == policy.config.env.renderer == "raster"  # type: ignore[attr-defined]
-    env.close()
-    assert not caplog.records
-
-
 def _tolerating_missing_gl():  # type: ignore[no-untyped-def]
     """Ignore that making the environment fails after the warning, where OpenGL is missing."""
     return contextlib.suppress(merl.core.MerlError)
@@ -409,7 +401,7 @@ BAD = {
     "train reach_duplo --num-envs 0": "num-envs must be at least 1 and at most 1,024, not 0",
     "train reach_duplo --agent.keys joints": "the observation has ['depth', 'image', 'proprio'",
     "train reach_duplo --image-size 8": "16",
-    "train reach_duplo --renderer wrap": "choose from auto, gl, raster",
+    "train reach_duplo --renderer wrap": "choose from gl, raster",
     "train reach_duplo --renderer raster --samples 5": (
         "samples must be at least 1 and at most 4, not 5"
     ),
@@ -638,7 +630,7 @@ def test_ctrl_c_before_training_writes_nothing(
         (lambda record: record["config"]["env"].update(goal="near"), "goal is unknown to this"),
         (
             lambda record: record["config"]["env"].update(renderer="warp"),
-            "renderer 'warp' is unknown: choose from auto, gl, raster",
+            "renderer 'warp' is unknown: choose from gl, raster",
         ),
         (lambda record: record.pop("machine"), "it has no 'machine'"),
         (lambda record: record.update(resumed=3), "cannot be read"),

@@ -185,9 +185,9 @@ def test_an_invalid_action_does_not_change_the_simulation(env_without_images, ac
         (
             "reach_duplo",
             {"renderer": "vulkan"},
-            "'vulkan' is unknown: choose from auto, gl, raster",
+            "'vulkan' is unknown: choose from gl, raster",
         ),
-        ("reach_duplo", {"renderer": ["gl"]}, "is unknown: choose from auto, gl, raster"),
+        ("reach_duplo", {"renderer": ["gl"]}, "is unknown: choose from gl, raster"),
         ("move_box", {"reward": "steep"}, "reward 'steep' is unknown: choose from paper, staged"),
         ("reach_duplo", {"proprio": "some"}, "proprio 'some' is unknown"),
         ("reach_duplo", {"image_size": 15}, "image-size must be at least 16 .*, not 15"),
@@ -277,16 +277,9 @@ def test_gymnasium_makes_every_task():
         env.close()
 
 
-def test_auto_renderer_is_replaced_in_the_config():
-    assert EnvConfig().renderer == EnvConfig(renderer="auto").renderer == "raster"
-    assert EnvConfig(renderer="gl").renderer == "gl"
-    with pytest.raises(MerlError, match="renderer"):
-        EnvConfig(renderer="vulkan")
-
-
 def test_defaults_of_the_settings():
     assert {field.name: field.default for field in fields(EnvConfig)} == {
-        "renderer": "auto",
+        "renderer": "raster",
         "image_size": 84,
         "samples": 1,
         "proprio": "paper",

@@ -17,7 +17,8 @@ from merl.bench.measuring import circumstances, seconds, shown, spread
 from merl.core import MerlError
 from merl.envs import make_env
 from merl.envs.arm_env import ArmEnv
-from merl.rendering.renderer import check_renderer, make_renderer
+from merl.rendering.opengl import enable_opengl
+from merl.rendering.renderer import make_renderer
 from merl.tasks.arm_task import CAMERA
 
 OURS, BARE, BLIND, THEIRS = (
@@ -139,7 +140,7 @@ def _bare(size: int) -> tuple[Step, Step, Step]:
 
 def _theirs() -> tuple[tuple[Step, Step, Step], str]:
     """Return reset, step and close of dm_control's task by its defaults, and its OpenGL library."""
-    check_renderer("gl")
+    enable_opengl()
     from dm_control import manipulation
 
     gl = import_module("OpenGL.GL")

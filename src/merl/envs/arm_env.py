@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from merl.core import MerlError
 from merl.envs.config import DEPTH_RANGE, OBSERVATION_KINDS, EnvConfig, ObservationKey
-from merl.rendering.renderer import Renderer, check_renderer, make_renderer
+from merl.rendering.opengl import enable_opengl
+from merl.rendering.renderer import Renderer, make_renderer
 from merl.tasks.arm_task import CAMERA, CONTROL_TIMESTEP, EPISODE_STEPS, ArmTask
 
 Observation = dict[str, Any]
@@ -48,8 +49,8 @@ class ArmEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise MerlError(f"render_mode {render_mode!r} is unknown: give 'rgb_array' or None")
         keys = {*config.observations}
-        if render_mode or CAMERA_KEYS & keys:
-            check_renderer(config.renderer)
+        if config.renderer == "gl" and (render_mode or CAMERA_KEYS & keys):
+            enable_opengl()
         self.task, self.config, self.render_mode = task, config, render_mode
         if "touch" in keys:
             task.robot.add_touch_sensors()

@@ -8,13 +8,7 @@ from typing import Annotated, Any, Literal
 from merl.core import Kind, MerlError
 from merl.core.choices import HandStart, ProprioSet, RewardForm, StateSet
 from merl.core.fields import NOT_EMPTY, Range, check_fields
-from merl.rendering.config import (
-    AUTO_RENDERER,
-    LARGEST_IMAGE,
-    RendererChoice,
-    Samples,
-    check_samples,
-)
+from merl.rendering.config import LARGEST_IMAGE, RendererName, Samples, check_samples
 
 ImageLayout = Literal["auto", "hwc", "chw"]
 ObservationKey = Literal["image", "depth", "wrist", "wrist_depth", "proprio", "touch", "state"]
@@ -36,10 +30,10 @@ DEPTH_RANGE = (0.0, 2.0)
 class EnvConfig:
     """Settings of an environment."""
 
-    renderer: RendererChoice = "auto"
+    renderer: RendererName = "raster"
     """Renderer of the images: `gl` (OpenGL, as in dm_control) or `raster` (a z-buffer that needs no
     OpenGL and is much faster on a CPU). Their images differ: to an agent they are different
-    cameras. `auto` selects `raster`."""
+    cameras."""
 
     image_size: Annotated[int, Range(16, LARGEST_IMAGE)] = 84
     """Height and width of the agent's image, in pixels; from 16 to 2048."""
@@ -81,8 +75,6 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.renderer == "auto":  # so a config and a run's record name the real one
-            object.__setattr__(self, "renderer", AUTO_RENDERER)
         check_samples(self.samples, self.image_size)
         if self.samples != 1 and self.renderer != "raster":
             raise MerlError(

@@ -105,16 +105,13 @@ class Policy:
             trust: import the environment that the run names, although you have not trained this run
                 on this machine. This runs code of the author of the run. It is not needed for the
                 environments of merl and Gymnasium.
-            **changes: fields of `EnvConfig`, and `render_mode`; the renderer `auto` is the renderer
-                of the training.
+            **changes: fields of `EnvConfig`, and `render_mode`.
 
         Raises:
             MerlError: the environment is not trusted, cannot be made, or has other spaces than in
                 training.
         """
         renderer = changes.get("renderer", self.config.env.renderer)
-        if renderer == "auto" and not self.config.has_user_env:
-            renderer = changes["renderer"] = self.config.env.renderer
         if renderer != self.config.env.renderer and not self.config.has_user_env:
             _LOG.warning(
                 "the agent was trained with renderer %r but now uses %r: their images differ, and "

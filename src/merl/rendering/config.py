@@ -8,11 +8,6 @@ from merl.core import MerlError
 from merl.core.fields import Range
 
 RendererName = Literal["gl", "raster"]
-RendererChoice = Literal["auto", "gl", "raster"]
-AUTO_RENDERER: RendererName = "raster"
-"""The renderer that replaces `auto`. It works on every machine, and is the faster one where both
-were measured (docs/explanation/benchmarks.md). It does not depend on the machine, so the same code
-gives the same images everywhere."""
 Samples = Annotated[int, Range(1, 4)]
 LARGEST_IMAGE = 2048
 """Most pixels along an edge of an image."""

@@ -12,15 +12,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from merl.rendering.config import RendererChoice
-from merl.rendering.opengl import GlRenderer, enable_opengl
+from merl.rendering.config import RendererName
+from merl.rendering.opengl import GlRenderer
 from merl.rendering.raster.renderer import RasterRenderer
 
 
 class Renderer(Protocol):
     """A renderer of square images of one simulation, from one camera."""
-
-    def __init__(self, physics: Any, camera: str, size: int) -> None: ...
 
     def render(self) -> NDArray[np.uint8]:
         """Return the current scene, uint8 (size, size, 3), as a new array."""
@@ -36,12 +34,12 @@ class Renderer(Protocol):
 
 
 def make_renderer(
-    name: RendererChoice, physics: Any, camera: str, size: int, samples: int = 1
+    name: RendererName, physics: Any, camera: str, size: int, samples: int = 1
 ) -> Renderer:
     """Make a renderer by its name.
 
     Args:
-        name: `gl` or `raster`; `EnvConfig` has already replaced `auto`.
+        name: `gl` or `raster`.
         physics: a `dm_control.mjcf.Physics`; its model is not changed.
         camera: the name of a camera in the model.
         size: height and width of the images, in pixels.
@@ -53,13 +51,3 @@ def make_renderer(
     if name == "raster":
         return RasterRenderer(physics, camera, size, samples)
     return GlRenderer(physics, camera, size)
-
-
-def check_renderer(name: RendererChoice) -> None:
-    """Check that a renderer works on this machine.
-
-    Raises:
-        MerlError: for `gl`, no OpenGL library works.
-    """
-    if name == "gl":
-        enable_opengl()

@@ -40,18 +40,19 @@ class Encoders(nn.Module):
         lengths: dict[str, Any] = {key: encoders[key].features for key in modalities}
         self.features: dict[str, int] = lengths
         self.shifted = tuple(key for key, m in modalities.items() if m.stacked and pad)
-        self.by_key = nn.ModuleDict({module_name(key): encoders[key] for key in modalities})
+        self._names = {key: module_name(key) for key in modalities}
+        self.by_key = nn.ModuleDict({self._names[key]: encoders[key] for key in modalities})
         scaled = [
             key for key, modality in modalities.items() if standardize and not modality.stacked
         ]
         self.scales = nn.ModuleDict(
-            {module_name(key): Standardize(modalities[key].shape[-1]) for key in scaled}
+            {self._names[key]: Standardize(modalities[key].shape[-1]) for key in scaled}
         )
 
     def observe(self, observation: Mapping[str, Tensor]) -> None:
         """Update the standardisation, and encoders with a method `observe`, from a batch."""
         for key, modality in self.modalities.items():
-            name = module_name(key)
+            name = self._names[key]
             for part in (self.scales, self.by_key):
                 observe = getattr(part[name], "observe", None) if name in part else None
                 if callable(observe):
@@ -74,7 +75,7 @@ class Encoders(nn.Module):
         for key, modality in self.modalities.items():
             if key not in observation:
                 continue
-            name, value = module_name(key), observation[key]
+            name, value = self._names[key], observation[key]
             if shifts and key in shifts:
                 value = shift(value, shifts[key], self.pad)
             encoder = self.by_key[name]

@@ -41,6 +41,7 @@ class ConvEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.frames = frames
+        self._span, self._offset = float(frames.span), frames.offset
         layers: list[nn.Module] = []
         height, width, source = frames.shape
         source *= stack
@@ -67,9 +68,9 @@ class ConvEncoder(nn.Module):
         assert first.bias is not None
         # The first layer's weights and bias absorb scale and offset, which is cheaper than scaling
         # all pixels: x / 255 - 0.5 = (x - 128) / 255 + 1 / 510.
-        weight, bias = first.weight / float(self.frames.span), first.bias
-        if self.frames.offset:
-            bias = bias + first.weight.sum(dim=(1, 2, 3)) / (2.0 * self.frames.span)
+        weight, bias = first.weight / self._span, first.bias
+        if self._offset:
+            bias = bias + first.weight.sum(dim=(1, 2, 3)) / (2.0 * self._span)
         pixels = self.frames.centred(stacks, compute_dtype(first.weight))
         maps = functional.conv2d(pixels, weight, bias, first.stride)  # (B, 32, h, w)
         for layer in others:

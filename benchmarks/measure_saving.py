@@ -43,6 +43,8 @@ def main(preset: str = "laptop", task: str = "reach_duplo", steps: int = 3000) -
             seed_steps=100,
             updates_per_step=0.02,
             threads=1,
+            num_envs=1,
+            synchronous=True,
         )
         config = dataclasses.replace(
             config, eval=dataclasses.replace(config.eval, every=steps, episodes=2, video="none")

@@ -94,7 +94,7 @@ def test_a_flipped_bit_is_named_or_changes_nothing(
     right = weights(expected)
     found = {"sound": 0, "damaged": 0}
     for name in files_of(run):
-        for trial in range(4):
+        for trial in range(2):
             copy = copy_of(run, tmp_path)
             if not flip(copy / name, dice):
                 continue
@@ -111,7 +111,7 @@ def test_a_flipped_bit_is_named_or_changes_nothing(
                 assert name.name in err
             kind = "damaged" if code else "sound"
             found[kind] += 1
-            if trial:
+            if trial or f"{saved(run)[0]:08d}" in name.parts:  # the oldest checkpoint is not read
                 continue
             code = main(["resume", str(copy), "--steps", str(end)])
             err = capsys.readouterr().err

@@ -30,6 +30,7 @@ from merl.core import (
 from merl.core.files import read_json
 from merl.core.signals import Interrupt
 from merl.core.watching import end_with_parent
+from merl.experiments.cloning_first import starts_cloned
 from merl.experiments.experiment import PlannedRun
 from merl.runs.resume import left_open
 from merl.runs.run import Run
@@ -84,10 +85,11 @@ def is_done(run: PlannedRun, episodes: int) -> bool:
     """
     if not (run.folder / CONFIG_FILE).exists():
         return False
-    recorded, wanted = flat(Run.open(run.folder).config), flat(run.config)
+    found = Run.open(run.folder)
+    recorded, wanted = flat(found.config), flat(starts_cloned(run.config, found))
     open_fields = left_open(run.config)
     for name, value in wanted.items():
-        same = recorded.get(name) == value or name in (*HARMLESS, *open_fields, "run_dir")
+        same = _equal(recorded.get(name), value) or name in (*HARMLESS, *open_fields, "run_dir")
         if not same and name in recorded:
             raise MerlError(
                 f"{run.folder} holds a run of another experiment ({name} {recorded[name]}, not "
@@ -97,6 +99,11 @@ def is_done(run: PlannedRun, episodes: int) -> bool:
     if evaluated is None or len(evaluated["episodes"]) < episodes:
         return False
     return run.config.minutes is not None or evaluated["step"] >= run.config.steps
+
+
+def _equal(recorded: Any, wanted: Any) -> bool:
+    """Return whether two values are equal; a sweep's file has paths as text."""
+    return bool(recorded == (Path(wanted) if isinstance(recorded, Path) and wanted else wanted))
 
 
 def evaluation_of(folder: Path) -> dict[str, Any] | None:

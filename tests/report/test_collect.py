@@ -23,6 +23,15 @@ def test_runs_that_differ_in_their_seed_are_one_group(tmp_path: Path) -> None:
     assert notes == ["reach_duplo: wide has one seed: no interval over seeds"]
 
 
+def test_seeds_that_start_with_policies_of_their_own_are_one_group(tmp_path: Path) -> None:
+    for seed, start in enumerate(("runs/a-s0-bc", "runs/a-s1-2-bc")):
+        write_run(tmp_path / f"reach_duplo-a-s{seed}", UP, RATES, seed=seed, start_from=start)
+    write_run(tmp_path / "reach_duplo-b-s0", UP, RATES, start_from="runs/a-small-bc")
+    groups, _ = collect([tmp_path])
+    labels = [(group.label, group.seeds) for group in groups]
+    assert labels == [("a", [0, 1]), ("b", [0])]
+
+
 def test_missing_seeds_are_named(tmp_path: Path) -> None:
     for seed in (0, 1, 2):
         write_run(tmp_path / f"reach_duplo-merl-s{seed}", UP, RATES, seed=seed)

@@ -31,6 +31,8 @@ from merl.report.references import form, references
 SUCCESS, RETURN = "success_end", "return"
 UNKNOWN_TASK = "unknown task"
 _SEED = re.compile(r"-s(\d+)(-\d+)?$")
+_SEED_OF_START = re.compile(r"-s\d+(-\d+)?(?=-bc$|$)")
+"""The seed in the name of the run that a run started with, e.g. its own RUN-bc."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,11 @@ class SeedRun:
     @property
     def learnt(self) -> dict[str, Any]:
         """The values that decide what is learnt, without the seed."""
-        return {k: v for k, v in self.values.items() if k not in (*HARMLESS, "seed")}
+        found = {k: v for k, v in self.values.items() if k not in (*HARMLESS, "seed")}
+        start = found.get("agent.start_from")
+        if isinstance(start, str):
+            found["agent.start_from"] = _SEED_OF_START.sub("", start)
+        return found
 
     @property
     def env(self) -> EnvConfig:

@@ -10,7 +10,7 @@ import termios
 import tty
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +21,7 @@ from gymnasium import spaces
 from rich.console import Console
 
 from merl.acting.instances import own_bounds
+from merl.acting.run_env import recipe
 from merl.cli.console import make_console
 from merl.cli.parsing import RunOptions, parse
 from merl.cli.running import tell_trusted
@@ -30,7 +31,7 @@ from merl.core.signals import Stopped
 from merl.demos.episode import Episode, EpisodeRecording
 from merl.demos.recorder import Recorder
 from merl.envs.frame_rate import frame_rate
-from merl.envs.user_env import load_module, make_user_env
+from merl.envs.user_env import load_module
 from merl.evaluation.exported import SUFFIXES, ExportedPolicy
 from merl.evaluation.policy import Policy, load_policy
 from merl.evaluation.realtime import Driven, Limits, check_rate, drive
@@ -50,7 +51,8 @@ class RunPolicyOptions(RunOptions):
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     """A run's folder, or a file of `merl export`."""
     env: Annotated[str | None, tyro.conf.arg(metavar="MODULE:FUNCTION")] = None
-    """The environment: module:function or a Gymnasium id; by default that of the run."""
+    """The environment: module:function, a Gymnasium id or a task of merl; by default that of the
+    run."""
     hz: Annotated[float, Range(0, 10_000, without=0)] | None = None
     """Steps per second; by default the environment's `render_fps`."""
     episodes: Annotated[int, Range(1)] = 1
@@ -232,14 +234,14 @@ def _policy(options: RunPolicyOptions) -> Policy | ExportedPolicy:
 
 
 def _env(options: RunPolicyOptions, policy: Policy | ExportedPolicy) -> gymnasium.Env[Any, Any]:
-    if options.env is not None:
-        if ":" in options.env:
-            load_module(options.env, Path.cwd())
-        known = policy.config.user_env if isinstance(policy, Policy) else None
-        return make_user_env(options.env, config=known)
-    if isinstance(policy, ExportedPolicy):
-        raise MerlError(f"{options.run} is a file of a policy: name the environment with --env")
-    return policy.make_env(trust=options.trust)
+    if options.env is None:
+        if isinstance(policy, ExportedPolicy):
+            raise MerlError(f"{options.run} is a file of a policy: name the environment with --env")
+        return policy.make_env(trust=options.trust)
+    if ":" in options.env:
+        load_module(options.env, Path.cwd())
+    known = policy.recipe if isinstance(policy, ExportedPolicy) else recipe(policy.config.evaluated)
+    return replace(known, task=options.env).instance()
 
 
 def _task(policy: Policy | ExportedPolicy) -> str:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 import merl
+from merl.acting.run_env import recipe
 from merl.agents.ddpg import DDPG
 from merl.core import MerlError, check_choice
 from merl.core.files import cause, remove
@@ -30,7 +31,7 @@ from merl.evaluation.exported import FORMER, NEXT, Form, Run, Values, card_of, l
 from merl.evaluation.policy import Policy
 from merl.evaluation.to_numpy import numpy_program
 from merl.runs import record
-from merl.runs.plain import describe
+from merl.runs.plain import describe, to_plain
 
 TOLERANCE = 1e-4
 """Largest relative difference between the actions of the policy and of its exported form."""
@@ -131,11 +132,14 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
         run = load_exported(part, names, outputs)
         _check_same(module, run, example, arguments)
         part.replace(output)
+        config = policy.config
         card = {
             "format": form,
             "merl": merl.__version__,
-            "task": policy.config.task,
-            "agent": policy.config.agent_name,
+            "task": config.task,
+            "env": None if config.has_user_env else to_plain(recipe(config.evaluated).env),
+            "action_repeat": config.action_repeat,
+            "agent": config.agent_name,
             "step": policy.step,
             "commit": recorded.get("commit"),
             "inputs": {name: _told(example[name]) for name in names},

@@ -7,6 +7,7 @@ import json
 import os
 import pty
 import shutil
+import signal
 import subprocess
 import sys
 import termios
@@ -255,3 +256,43 @@ def test_a_stop_before_the_first_reset_moves_nothing(
     monkeypatch.setattr(Stop, "asked", lambda self: True)
     assert main(["run", POLICY, "--env", f"{robot}:failing"]) == 0
     assert "stopped before the first step" in flat(capsys.readouterr().out)
+
+
+def test_ignored_signals_stay_ignored_and_a_keyboard_may_lack(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "stdin", None)  # as after <&-
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as by nohup
+    try:
+        with Stop.listening() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop.asked()
+            assert stop.keys == "Ctrl-C"
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+BACKGROUND = """
+import os
+from merl.cli.run import Stop
+child = os.fork()
+if child == 0:
+    os.setpgid(0, 0)  # as after &
+    with Stop.listening() as stop:
+        print(stop.keys, flush=True)
+    os._exit(0)
+print("suspended" if os.WIFSTOPPED(os.waitpid(child, os.WUNTRACED)[1]) else "ended")
+"""
+
+
+def test_in_the_background_it_leaves_the_keyboard_alone() -> None:
+    _, theirs = pty.openpty()
+    done = subprocess.run(
+        [sys.executable, "-c", BACKGROUND],
+        stdin=theirs,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(theirs, termios.TIOCSCTTY, 0),
+    )
+    assert done.stdout.split() == ["Ctrl-C", "ended"]

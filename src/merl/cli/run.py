@@ -141,10 +141,11 @@ class Stop:
     @classmethod
     @contextmanager
     def listening(cls) -> Iterator[Stop]:
-        """Listen to signals, and to the keys of the terminal if there is one."""
-        terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
+        """Listen to signals that are not ignored, as by nohup, and to the keys of the terminal."""
+        terminal = _keyboard()
         stop = cls(terminal)
-        former = {number: signal.signal(number, stop.note) for number in SIGNALS}
+        heard = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+        former = {number: signal.signal(number, stop.note) for number in heard}
         before = None if terminal is None else termios.tcgetattr(terminal)
         try:
             if terminal is not None:
@@ -178,6 +179,15 @@ class Stop:
             keys = os.read(self._terminal, 4096)
             self._pressed |= not keys or any(key in STOP_KEYS for key in keys)
         return self._pressed or self.number != 0
+
+
+def _keyboard() -> int | None:
+    """Return the terminal whose keys this process gets; None without one and in the background."""
+    with suppress(AttributeError, OSError, ValueError):  # no stdin, a closed one, no terminal
+        terminal = sys.stdin.fileno()
+        if os.tcgetpgrp(terminal) == os.getpgrp():
+            return terminal
+    return None
 
 
 def check_fits(policy: Policy | ExportedPolicy, env: gymnasium.Env[Any, Any]) -> None:

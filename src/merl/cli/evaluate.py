@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from merl.cli.console import make_console
-from merl.cli.parsing import RunOptions, check_writable, parse, write_json
+from merl.cli.parsing import OpenOptions, check_writable, parse, write_json
 from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
 from merl.core import MerlError
@@ -21,7 +21,7 @@ from merl.training.live_view import describe
 
 
 @dataclass(frozen=True)
-class EvaluateOptions(RunOptions):
+class EvaluateOptions(OpenOptions):
     """Run a trained policy without exploration noise, from the fixed start states."""
 
     episodes: Annotated[int, Range(1)] = 10

@@ -10,7 +10,7 @@ import tyro
 from rich.filesize import decimal
 
 from merl.cli.console import make_console
-from merl.cli.parsing import RunOptions, check_writable, parse
+from merl.cli.parsing import OpenOptions, check_writable, parse
 from merl.cli.running import tell_trusted
 from merl.evaluation.export import export_policy
 from merl.evaluation.exported import SUFFIXES, Form
@@ -19,7 +19,7 @@ from merl.runs.run import Run
 
 
 @dataclass(frozen=True)
-class ExportOptions(RunOptions):
+class ExportOptions(OpenOptions):
     """Write a trained policy to one file that runs without merl."""
 
     to: Form = "onnx"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from merl.cli.console import make_console
-from merl.cli.parsing import RunOptions, parse
+from merl.cli.parsing import OpenOptions, parse
 from merl.cli.running import tell_trusted
 from merl.core import MerlError
 from merl.core.fields import Range
@@ -18,7 +18,7 @@ from merl.runs.run import Run
 
 
 @dataclass(frozen=True)
-class RobustnessOptions(RunOptions):
+class RobustnessOptions(OpenOptions):
     """Evaluate a trained policy while its senses, its actions or the scene are disturbed."""
 
     episodes: Annotated[int, Range(1)] = 50

@@ -23,7 +23,7 @@ from rich.console import Console
 from merl.acting.instances import own_bounds
 from merl.acting.run_env import recipe
 from merl.cli.console import make_console
-from merl.cli.parsing import RunOptions, parse
+from merl.cli.parsing import OpenOptions, parse
 from merl.cli.running import tell_trusted
 from merl.core import MerlError, counted
 from merl.core.fields import Range
@@ -45,7 +45,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True)
-class RunPolicyOptions(RunOptions):
+class RunOptions(OpenOptions):
     """Run a policy in an environment in real time, e.g. on a robot. Space or Ctrl-C stops it."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
@@ -74,7 +74,7 @@ class RunPolicyOptions(RunOptions):
 
 def run(args: list[str]) -> int:
     """Run a policy in real time: merl run POLICY [--env MODULE:FUNCTION] [--hz RATE] ..."""
-    options = parse(RunPolicyOptions, "merl run", args)
+    options = parse(RunOptions, "merl run", args)
     console = make_console()
     log = options.log and options.log.absolute()  # the environment may change the working folder
     policy = _policy(options)
@@ -230,7 +230,7 @@ def check_fits(policy: Policy | ExportedPolicy, env: gymnasium.Env[Any, Any]) ->
         )
 
 
-def _policy(options: RunPolicyOptions) -> Policy | ExportedPolicy:
+def _policy(options: RunOptions) -> Policy | ExportedPolicy:
     if options.run.suffix == SUFFIXES["numpy"]:
         raise MerlError(
             f"{options.run} is Python code: import its Policy into a program of your own, or "
@@ -243,7 +243,7 @@ def _policy(options: RunPolicyOptions) -> Policy | ExportedPolicy:
     return load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
 
 
-def _env(options: RunPolicyOptions, policy: Policy | ExportedPolicy) -> gymnasium.Env[Any, Any]:
+def _env(options: RunOptions, policy: Policy | ExportedPolicy) -> gymnasium.Env[Any, Any]:
     if options.env is None:
         if isinstance(policy, ExportedPolicy):
             raise MerlError(f"{options.run} is a file of a policy: name the environment with --env")

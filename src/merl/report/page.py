@@ -201,17 +201,17 @@ def _curves(groups: Sequence[Group], task: str, name: str, x: str, out: Path) ->
         return None
     known = groups[0].runs[0].references if name == RETURN else {}
     shown = {word: known[word] for word in (RANDOM, EXPERT) if word in known}
-    stem = out / f"{slug(task)}-{name}-{x}"
+    stem = f"{slug(task)}-{name}-{x}"
     for suffix in (".png", ".svg"):
         learning_curves(
             found,
-            stem.with_suffix(suffix),
+            out / f"{stem}{suffix}",  # a task's name may have dots
             x="minutes" if x == "minutes" else "steps",
             name=f"eval/{name}",
             band="bootstrap",
             references=shown,
         )
-    return stem.with_suffix(".svg")
+    return out / f"{stem}.svg"
 
 
 def _overall_section(summaries: Sequence[Overall], tasks: Sequence[str], out: Path) -> str:

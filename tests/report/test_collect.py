@@ -57,6 +57,19 @@ def test_equal_names_are_told_apart_by_what_differs(tmp_path: Path) -> None:
     assert [group.label for group in groups] == ["mine (agent.tau 1)", "mine (agent.tau 2)"]
 
 
+def test_labels_have_as_many_values_as_tell_them_apart(tmp_path: Path) -> None:
+    runs = [
+        write_run(tmp_path / str(i) / "mine", UP, RATES, a=a, b=a, c=a, d=d)
+        for i, (a, d) in enumerate(((1, 5), (1, 6), (3, 5)))
+    ]
+    groups, _ = collect(runs)
+    assert [group.label for group in groups] == [
+        "mine (agent.a 1, agent.b 1, agent.c 1, agent.d 5)",
+        "mine (agent.a 1, agent.b 1, agent.c 1, agent.d 6)",
+        "mine (agent.a 3, agent.b 3, agent.c 3)",
+    ]
+
+
 def test_tasks_are_never_mixed(tmp_path: Path) -> None:
     write_run(tmp_path / "move_box-merl-s0", UP, RATES, task="move_box")
     write_run(tmp_path / "reach_duplo-merl-s0", UP, RATES)

@@ -271,13 +271,19 @@ def _grouped(runs: Sequence[SeedRun]) -> list[Group]:
 
 
 def _distinction(run: SeedRun, twins: Sequence[SeedRun]) -> str:
-    """Return the values in which a run differs from others of its label."""
+    """Return values in which a run differs from all others of its label: three, or more."""
     names = [
         name
         for name, value in run.learnt.items()
         if any(other.learnt.get(name) != value for other in twins)
     ]
-    return ", ".join(f"{name} {run.values[name]}" for name in names[:3]) or run.name
+
+    def told(each: SeedRun, count: int) -> str:
+        return ", ".join(f"{name} {each.learnt.get(name)}" for name in names[:count])
+
+    counts = range(3, len(names))
+    few = (n for n in counts if sum(told(each, n) == told(run, n) for each in twins) == 1)
+    return told(run, next(few, len(names))) or run.name
 
 
 def _about_seeds(groups: Sequence[Group]) -> Iterator[str]:

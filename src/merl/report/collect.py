@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,13 @@ class SeedRun:
         return {one.name: one.returns.mean for one in references(self.task, self.env)}
 
     @property
+    def last_step(self) -> int:
+        """The environment steps of the last row of the metrics that has them; 0 without one."""
+        steps = self.metrics["step"]
+        known = steps[~np.isnan(steps)]
+        return int(known[-1]) if len(known) else 0
+
+    @property
     def videos(self) -> dict[int, Path]:
         """The videos of evaluations, by step."""
         found = sorted((self.path / "videos").glob("*.mp4")) if self.path.is_dir() else []
@@ -186,7 +193,7 @@ def collect(paths: Iterable[Path]) -> tuple[list[Group], list[str]]:
             notes.append(f"skipped: {path} has no evaluation yet")
             continue
         if run.active:
-            notes.append(f"{run.name} is still training: at step {int(run.metrics['step'][-1]):,}")
+            notes.append(f"{run.name} is still training: at step {run.last_step:,}")
         runs.append(run)
     if not runs:
         raise MerlError("no run can be read: " + ("; ".join(notes) or "no path was given"))
@@ -209,12 +216,10 @@ def read_run(path: Path) -> SeedRun:
         raise MerlError(f"{path} contains infinite numbers")
     record, evaluation = _json(path / CONFIG_FILE), _json(path / EVALUATION_FILE)
     episodes, step = evaluation.get("episodes"), evaluation.get("step")
-    last = float(metrics["step"][-1]) if len(metrics["step"]) else 0.0
-    is_newest = isinstance(step, int) and step >= last  # the run was not trained further
     rows = [row for row in episodes if _is_row(row)] if isinstance(episodes, list) else []
-    run = SeedRun(
-        path, record, metrics, tuple(rows) if is_newest else (), _locked(path / LOCK_FILE)
-    )
+    run = SeedRun(path, record, metrics, tuple(rows), _locked(path / LOCK_FILE))
+    if not isinstance(step, int) or step < run.last_step:  # the run was trained further
+        run = replace(run, episodes=())
     try:
         _ = run.form, run.references  # a record may come from anyone
     except (MerlError, TypeError, ValueError, AttributeError) as error:
@@ -300,7 +305,7 @@ def _about_seeds(groups: Sequence[Group]) -> Iterator[str]:
             if twice:
                 named = ", ".join(map(str, sorted(twice, key=str)))
                 yield f"{task}: {group.label} has seed {named} more than once: each run counts"
-            ends = {int(run.metrics["step"][-1]) for run in group.runs}
+            ends = {run.last_step for run in group.runs}
             if len(ends) > 1:
                 yield (
                     f"{task}: the seeds of {group.label} are of unequal length: their mean ends at "

@@ -91,7 +91,7 @@ def row_of(group: Group) -> Row:
     """Compute the results of a group."""
     runs, seeds = group.runs, len(group.runs)
     curves = [run.curve(RETURN) for run in runs]
-    end = min(float(run.metrics["step"][-1]) for run in runs)
+    end = min(float(run.last_step) for run in runs)
     results = {"final return": Estimate.of(group.final(RETURN), seeds)}
     if all(len(curve.steps) for curve in curves):
         end = min(float(curve.steps[-1]) for curve in curves)

@@ -64,7 +64,7 @@ class Outcome:
 
     Attributes:
         name: the run's name.
-        error: why it failed, in one line; None if it is done.
+        error: why it failed, in one line; None if it is done, or stopped.
         seconds: how long it took, this time.
     """
 
@@ -144,7 +144,7 @@ def execute(
     settings: Settings,
     stopped: Callable[[], bool] = lambda: False,
     folder: Path | None = None,
-) -> str | None:
+) -> Outcome:
     """Train or resume a run to its end and evaluate it; its output goes to NAME.log.
 
     Args:
@@ -152,10 +152,19 @@ def execute(
         settings: how it is run.
         stopped: whether to stop; then the run saves and ends.
         folder: the working folder; None for this process's.
-
-    Returns:
-        Why it failed, in one line; None if it is done, or stopped.
     """
+    begin = time.monotonic()
+    try:
+        error = _executed(run, settings, stopped, folder)
+    except OSError as failed:  # the log or the process cannot be made
+        error = f"it cannot be started: {failed}"
+    return Outcome(run.name, error, time.monotonic() - begin)
+
+
+def _executed(
+    run: PlannedRun, settings: Settings, stopped: Callable[[], bool], folder: Path | None
+) -> str | None:
+    """Return why a run failed, in one line; None if it is done, or stopped; see `execute`."""
     run.folder.parent.mkdir(parents=True, exist_ok=True)
     log = run.folder.with_name(f"{run.name}.log")
     for command in commands(run, settings):
@@ -257,15 +266,11 @@ def run_here(
                 run = waiting.pop(0)
                 active[run.name] = run
             started(run)
-            begin = time.monotonic()
-            try:
-                error = execute(run, settings, stop.is_set)
-            except OSError as failed:  # the log or the process cannot be made
-                error = f"it cannot be started: {failed}"
+            outcome = execute(run, settings, stop.is_set)
             with lock:
                 del active[run.name]
                 if not stop.is_set():
-                    ended(Outcome(run.name, error, time.monotonic() - begin))
+                    ended(outcome)
 
     threads = [threading.Thread(target=work) for _ in range(min(jobs, len(runs)))]
     with Interrupt().listening() as interrupt:

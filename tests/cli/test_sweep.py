@@ -137,7 +137,8 @@ def test_a_killed_run_is_resumed_and_a_failing_one_stops_no_other(
 
 
 def test_a_run_reports_its_own_time(folder: Path) -> None:
-    run = PlannedRun("mine", folder / "mine", "one", TrainConfig("reach_duplo"), ("nothing",))
+    command = ("nothing", "--run-dir", "mine")
+    run = PlannedRun("mine", folder / "mine", "one", TrainConfig("nothing"), command)
     begin = time.monotonic()
     outcome = execute(run, Settings(retries=0))
     assert outcome.name == "mine"

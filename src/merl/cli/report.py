@@ -63,15 +63,17 @@ def _report(options: ReportOptions, console: Console, before: list[str]) -> list
         if options.watch is None:
             raise
         groups, notes = [], [str(error)]  # the first evaluation may still come
+    labels, wrong = sorted({group.label for group in groups}), None
+    if options.baseline is not None and groups and options.baseline not in labels:
+        hint = suggest(options.baseline, labels)
+        wrong = f"--baseline {options.baseline!r} is none of the curves: {hint}"
+        notes += [wrong] if options.watch else []  # as above
     for note in notes:
         if note not in before:
             console.print(note, highlight=False, soft_wrap=True)
-    if options.baseline is not None and groups:
-        labels = sorted({group.label for group in groups})
-        if options.baseline not in labels:
-            hint = suggest(options.baseline, labels)
-            raise MerlError(f"--baseline {options.baseline!r} is none of the curves: {hint}")
-        groups.sort(key=lambda group: group.label != options.baseline)
+    if wrong is not None and options.watch is None:
+        raise MerlError(wrong)
+    groups.sort(key=lambda group: group.label != options.baseline)
     if groups:
         page = write_report(groups, notes, options.out, options.title, options.watch)
         runs = sum(len(group.runs) for group in groups)

@@ -35,6 +35,10 @@ def test_published_references_name_their_source():
     assert "published" in published.source
 
 
+def test_episodes_that_are_cut_off_have_no_references():
+    assert references("reach_duplo", limit=249) == ()
+
+
 def test_a_user_task_has_no_references():
     assert references("my_package:make_env") == ()
 

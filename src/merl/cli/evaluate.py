@@ -68,7 +68,8 @@ def evaluate(args: list[str]) -> int:
     images = "" if policy.config.has_user_env else f", {renderer} images"
     line = f"{options.run} at step {policy.step:,}{images}: {describe(result)}"
     console.print(line, highlight=False)
-    known = references(config.task, config.evaluated.env)
+    limit = options.max_episode_steps or config.eval.max_episode_steps
+    known = references(config.task, config.evaluated.env, limit)
     if known:
         console.print(comparison(config.task, result, known), highlight=False)
     if options.video is not None:

@@ -158,11 +158,8 @@ def _end(outcome: Outcome) -> tuple[int, str]:
 
 def _scale(config: TrainConfig) -> dict[str, float]:
     """Return the reference returns for the live view; none for an unknown environment."""
-    return {
-        reference.name: reference.returns.mean
-        for reference in references(config.task, config.evaluated.env)
-        if reference.name in (RANDOM, EXPERT)
-    }
+    known = references(config.task, config.evaluated.env, config.eval.max_episode_steps)
+    return {row.name: row.returns.mean for row in known if row.name in (RANDOM, EXPERT)}
 
 
 def _outlook(setup: Setup, what: str, done: int) -> str:

@@ -31,16 +31,16 @@ def summarize(outcome: Outcome, console: Console) -> None:
 
     The run is already saved. If a part of the summary fails, print one line and continue.
     """
-    run, trained = outcome.run, outcome.evaluation
+    run, trained, config = outcome.run, outcome.evaluation, outcome.run.config
     from merl.report.figures import learning_curve  # Matplotlib imports slowly
 
-    known = references(run.config.task, run.config.evaluated.env)
-    if trained is not None and not known and run.config.eval.references:
+    known = references(config.task, config.evaluated.env, config.eval.max_episode_steps)
+    if trained is not None and not known and config.eval.references:
         with console.status(f"measuring returns of {' and '.join(FLOORS)}", spinner="line"):
-            known = _measured(run.config, console, trained.success_end is not None)
+            known = _measured(config, console, trained.success_end is not None)
     if trained is not None:
         console.print()
-        console.print(comparison(run.config.task, trained, known))
+        console.print(comparison(config.task, trained, known))
     lines = {reference.name: reference.returns.mean for reference in known}
     try:
         curve = learning_curve(run.path, run.path / "curve.png", references=lines)

@@ -26,7 +26,7 @@ from merl.core.files import open_file, read_json
 from merl.envs.config import EnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.report.curves import Array, Curve, curve_of, read_metrics
-from merl.report.references import form, references
+from merl.report.references import EPISODE, form, references
 
 SUCCESS, RETURN = "success_end", "return"
 UNKNOWN_TASK = "unknown task"
@@ -113,7 +113,8 @@ class SeedRun:
     @property
     def references(self) -> dict[str, float]:
         """The known returns of the task in this form, by name."""
-        return {one.name: one.returns.mean for one in references(self.task, self.env)}
+        limit = self.values.get("eval.max_episode_steps", EPISODE)
+        return {one.name: one.returns.mean for one in references(self.task, self.env, limit)}
 
     @property
     def last_step(self) -> int:

@@ -19,6 +19,8 @@ RANDOM = "random actions"
 """Name of the reference with random actions."""
 EXPERT = "scripted expert"
 """Name of the reference that solves the task with the simulator's state."""
+EPISODE = 250
+"""Environment steps of an episode over which all returns are measured."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +43,19 @@ class Reference:
     terms: dict[str, float] = field(default_factory=dict)
 
 
-def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]:
+def references(
+    task: str, env: EnvConfig | None = None, limit: int = EPISODE
+) -> tuple[Reference, ...]:
     """Return the references of a task, from the lowest to the highest; empty if not measured.
 
     Args:
         task: the task's name.
         env: the form of the task; `benchmarks/measure_references.py` lists the measured forms.
+        limit: environment steps after which an evaluation cuts an episode off: shorter episodes
+            have no references.
     """
+    if limit < EPISODE:
+        return ()
     return tuple(
         Reference(
             row["name"],

@@ -7,7 +7,7 @@ numbers are quoted with their source.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -33,14 +33,12 @@ class Reference:
             mean.
         success_end: rate of success at the end of the episode, in the same form; None if unknown.
         source: origin of the numbers.
-        terms: {term of the reward: its mean sum over an episode}; empty if unknown.
     """
 
     name: str
     returns: Interval
     success_end: Interval | None
     source: str
-    terms: dict[str, float] = field(default_factory=dict)
 
 
 def references(
@@ -62,7 +60,6 @@ def references(
             Interval(*row["return"]),
             None if row["success_end"] is None else Interval(*row["success_end"]),
             row["source"],
-            row.get("terms", {}),
         )
         for row in _measured().get(form(task, env or EnvConfig()), [])
     )

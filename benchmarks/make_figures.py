@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from merl.core.statistics import bootstrap_interval, wilson_interval
-from merl.experiments.small_tasks import SPLIT, optimum, returns_of
+from small_tasks import SPLIT, optimum, returns_of
 from merl.report.curves import Curve, curve_of, read_metrics
 from merl.report.figures import learning_curves, reward_terms
 from merl.report.references import references

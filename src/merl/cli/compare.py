@@ -42,7 +42,7 @@ def compare(args: list[str]) -> int:
     for name, *values in _results(runs):
         table.add_row(name, *values)
     console = make_console()
-    console.print(table, highlight=False)
+    console.print(table)
     if not differing:
         console.print("config, versions and machine are the same")
     return 0

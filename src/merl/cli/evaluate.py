@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import OpenOptions, check_writable, parse, write_json
 from merl.cli.running import tell_trusted
 from merl.cli.summary import comparison
@@ -67,13 +67,13 @@ def evaluate(args: list[str]) -> int:
     renderer = options.renderer or policy.config.env.renderer
     images = "" if policy.config.has_user_env else f", {renderer} images"
     line = f"{options.run} at step {policy.step:,}{images}: {describe(result)}"
-    console.print(line, highlight=False)
+    console.print(line)
     limit = options.max_episode_steps or config.eval.max_episode_steps
     known = references(config.task, config.evaluated.env, limit)
     if known:
-        console.print(comparison(config.task, result, known), highlight=False)
+        console.print(comparison(config.task, result, known))
     if options.video is not None:
-        console.print(f"video: {options.video}", highlight=False, soft_wrap=True)
+        say(console, f"video: {options.video}")
     if json_file is not None:
         rows = [
             {

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from rich.filesize import decimal
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import OpenOptions, check_writable, parse
 from merl.cli.running import tell_trusted
 from merl.evaluation.export import export_policy
@@ -46,14 +46,13 @@ def export(args: list[str]) -> int:
     with console.status("exporting", spinner="line"):
         card = export_policy(policy, out, options.to)
     size, times = decimal(out.stat().st_size), card["milliseconds"]
-    console.print(
+    say(
+        console,
         f"{out}: {size}; an action takes {times['p50']} ms (99 %: {times['p99']} ms) on one thread",
-        highlight=False,
-        soft_wrap=True,
     )
     for kind in ("inputs", "outputs"):
         for name, told in card[kind].items():
             shape = tuple(told["shape"])
-            console.print(f"  {kind[:-1]} {name}: {told['dtype']} {shape}", highlight=False)
-    console.print(f"card: {out}.json", highlight=False, soft_wrap=True)
+            console.print(f"  {kind[:-1]} {name}: {told['dtype']} {shape}")
+    say(console, f"card: {out}.json")
     return 0

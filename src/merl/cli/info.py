@@ -34,7 +34,7 @@ def info(args: list[str]) -> int:
     with console.status("measuring", spinner="line"):
         for name, value in _rows():
             table.add_row(name, value)
-    console.print(table, highlight=False)
+    console.print(table)
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import parse
 from merl.core import MerlError, counted, suggest
 from merl.core.fields import Range, check_fields
@@ -70,16 +70,12 @@ def _report(options: ReportOptions, console: Console, before: list[str]) -> list
         notes += [wrong] if options.watch else []  # as above
     for note in notes:
         if note not in before:
-            console.print(note, highlight=False, soft_wrap=True)
+            say(console, note)
     if wrong is not None and options.watch is None:
         raise MerlError(wrong)
     groups.sort(key=lambda group: group.label != options.baseline)
     if groups:
         page = write_report(groups, notes, options.out, options.title, options.watch)
         runs = sum(len(group.runs) for group in groups)
-        console.print(
-            f"{page}: {counted(runs, 'run')}, {counted(len(groups), 'curve')}",
-            highlight=False,
-            soft_wrap=True,
-        )
+        say(console, f"{page}: {counted(runs, 'run')}, {counted(len(groups), 'curve')}")
     return notes

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import OpenOptions, parse
 from merl.cli.running import tell_trusted
 from merl.core import MerlError
@@ -41,14 +41,14 @@ def robustness(args: list[str]) -> int:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise MerlError(f"--out {out} cannot be created: {error.strerror}") from None
-    console.print(f"{options.run} at step {policy.step:,}", highlight=False)
+    console.print(f"{options.run} at step {policy.step:,}")
     rows: list[Row] = []
     for each in evaluations(policy, options.episodes, trust=options.trust):
         it, how = each.evaluation, each.disturbance
         row = Row.of(how.sense, how.name, len(it.episodes), it.returns, it.success_end)
         rows.append(row)
-        console.print(f"{row.sense:8} {row.disturbance:14} {row.text}", highlight=False)
+        console.print(f"{row.sense:8} {row.disturbance:14} {row.text}")
         write_rows(rows, out / "robustness.csv")
     figure = draw_rows(rows, f"{policy.config.task} under disturbances", out / "robustness.png")
-    console.print(f"{figure}", highlight=False, soft_wrap=True)
+    say(console, f"{figure}")
     return 0

@@ -18,11 +18,10 @@ import gymnasium
 import numpy as np
 import tyro
 from gymnasium import spaces
-from rich.console import Console
 
 from merl.acting.instances import own_bounds
 from merl.acting.run_env import recipe
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import OpenOptions, parse
 from merl.cli.running import tell_trusted
 from merl.core import MerlError, counted
@@ -95,7 +94,7 @@ def run(args: list[str]) -> int:
             recorder = Recorder(log, name, who, env.observation_space, env.action_space)
         policy(env.observation_space.sample())  # the first call takes longer
         stop = stack.enter_context(Stop.listening())
-        _tell(console, f"{options.run} in {name}, {rate:g} steps per second: {stop.keys} stops")
+        say(console, f"{options.run} in {name}, {rate:g} steps per second: {stop.keys} stops")
         code = acted = 0
         for index in range(options.episodes):
             if stop.asked():
@@ -113,16 +112,16 @@ def run(args: list[str]) -> int:
             acted += len(recording)
             if len(recording):
                 episode = recording.finish(terminated=terminated)
-                _tell(console, f"episode {index + 1}: {_told(episode, found)}")
+                say(console, f"episode {index + 1}: {_told(episode, found)}")
             if found.end == "late":
                 message = f"{counted(options.max_late, 'step')} in a row missed the deadline"
-                _tell(console, f"stopped: {message}: use a lower --hz")
+                say(console, f"stopped: {message}: use a lower --hz")
                 code = 1
                 break
         if not acted:
-            _tell(console, "stopped before the first step")
+            say(console, "stopped before the first step")
         if recorder is not None and recorder.demonstrations.lines:
-            _tell(console, f"log: {log}")
+            say(console, f"log: {log}")
     return 128 + stop.number if stop.number else code
 
 
@@ -257,10 +256,6 @@ def _env(options: RunOptions, policy: Policy | ExportedPolicy) -> gymnasium.Env[
 def _task(policy: Policy | ExportedPolicy) -> str:
     assert isinstance(policy, Policy)
     return policy.config.task
-
-
-def _tell(console: Console, line: str) -> None:
-    console.print(line, highlight=False, soft_wrap=True)
 
 
 def _told(episode: Episode, found: Driven) -> str:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.filesize import decimal
 
 from merl.acting.run_env import key_lines
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.duration import duration
 from merl.cli.summary import summarize
 from merl.config import CUSTOM, Source, TrainConfig
@@ -98,13 +98,13 @@ def _train(
     if outcome.signal is not None:
         outcome.check_saved()
         console.print(f"stopped at step {outcome.progress.step:,} and saved: resume with")
-        console.print(f"    {resume_line(folder)}", highlight=False, soft_wrap=True)
+        say(console, f"    {resume_line(folder)}")
         return 128 + outcome.signal
     try:
         summarize(outcome, console)
     except KeyboardInterrupt:
         outcome.check_saved()
-        console.print(f"{folder} is trained and saved", highlight=False, soft_wrap=True)
+        say(console, f"{folder} is trained and saved")
         raise
     outcome.check_saved()
     return 0
@@ -128,7 +128,7 @@ def _fit(
             )
             stack.enter_context(trainer)
         done = resumed[1].step if resumed and resumed[1] else 0
-        console.print(_outlook(trainer.setup, what, done), highlight=False)
+        console.print(_outlook(trainer.setup, what, done))
         seconds = trainer.setup.timing.seconds(trainer.config)
         if resumed is None and source.preset != "laptop" and seconds > DAY:
             console.print("that is more than a day: --preset laptop is made for such a machine")

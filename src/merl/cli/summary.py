@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from merl.acting.run_env import make_run_env
+from merl.cli.console import say
 from merl.config import TrainConfig
 from merl.core import counted
 from merl.core.files import entries
@@ -44,27 +45,21 @@ def summarize(outcome: Outcome, console: Console) -> None:
     lines = {reference.name: reference.returns.mean for reference in known}
     try:
         curve = learning_curve(run.path, run.path / "curve.png", references=lines)
-        console.print(f"learning curve: {curve}", highlight=False, soft_wrap=True)
+        say(console, f"learning curve: {curve}")
     except Exception as error:  # Matplotlib's errors too
-        console.print(f"the curve was not drawn: {reason(error)}", highlight=False)
+        console.print(f"the curve was not drawn: {reason(error)}")
     videos: list[Path] = []
     with suppress(OSError):
         videos = [path for path in entries(run.videos) if path.suffix == ".mp4"]
     if videos:
-        console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
+        say(console, f"video: {videos[-1]}")
     if trained is not None:
-        console.print(_verdict(known, trained, outcome.progress.updates), highlight=False)
+        console.print(_verdict(known, trained, outcome.progress.updates))
     elif outcome.saved:
-        console.print(
-            f"{run.path} is trained and saved, and not evaluated", highlight=False, soft_wrap=True
-        )
-    console.print(_resume_hint(outcome), highlight=False, soft_wrap=True)
-    console.print(
-        f"(its replay, {run.replay}, is only needed to resume; you may delete it otherwise)",
-        highlight=False,
-        soft_wrap=True,
-        style="dim",
-    )
+        say(console, f"{run.path} is trained and saved, and not evaluated")
+    say(console, _resume_hint(outcome))
+    replay = f"(its replay, {run.replay}, is only needed to resume; you may delete it otherwise)"
+    say(console, replay, style="dim")
 
 
 def floors(
@@ -117,7 +112,7 @@ def _measured(
     try:
         return floors(config, reports_success=reports_success)
     except Exception as error:
-        console.print(f"there is nothing to compare with: {reason(error)}", highlight=False)
+        console.print(f"there is nothing to compare with: {reason(error)}")
         return ()
 
 

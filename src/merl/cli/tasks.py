@@ -14,7 +14,7 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import parse
 from merl.core import MerlError
 from merl.envs import make_env
@@ -41,14 +41,14 @@ def tasks(args: list[str]) -> int:
     console = make_console()
     for name in TASKS:
         image = _image(name)
-        console.print(_entry(name, image, console), highlight=False)
+        console.print(_entry(name, image, console))
         for line in _commands(name):
-            console.print(line, highlight=False, soft_wrap=True)
+            say(console, line)
         console.print()
         if folder is not None:
             path = folder / f"{name}.png"
             _write(path, image)
-            console.print(f"image: {path}\n", highlight=False, soft_wrap=True)
+            say(console, f"image: {path}\n")
     return 0
 
 

@@ -104,7 +104,9 @@ def run(args: list[str]) -> int:
             policy.reset()
             recording, terminated = EpisodeRecording(observation), False
             try:
-                found = drive(policy, env, observation, recording, rate, limits, stop.asked)
+                found = drive(
+                    policy, env, observation, rate, limits, stop.asked, record=recording.add
+                )
                 terminated = found.end == "terminated"
             finally:  # also after an error, whose episode is the most interesting
                 if recorder is not None and len(recording):

@@ -9,8 +9,8 @@ from typing import Annotated
 from merl.cli.console import make_console, say
 from merl.cli.parsing import OpenOptions, parse
 from merl.cli.running import tell_trusted
-from merl.core import MerlError
 from merl.core.fields import Range
+from merl.core.files import reporting
 from merl.evaluation.policy import load_policy
 from merl.evaluation.robustness import robustness as evaluations
 from merl.report.robustness import Row, draw_rows, write_rows
@@ -37,10 +37,8 @@ def robustness(args: list[str]) -> int:
         tell_trusted(Run.open(options.run))
     policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
     out = (options.out or Path("robustness", options.run.resolve().name)).absolute()
-    try:
+    with reporting(f"--out {out} cannot be created"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MerlError(f"--out {out} cannot be created: {error.strerror}") from None
     console.print(f"{options.run} at step {policy.step:,}")
     rows: list[Row] = []
     for each in evaluations(policy, options.episodes, trust=options.trust):

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from merl.cli.console import make_console, say
 from merl.cli.parsing import parse
-from merl.core import MerlError
+from merl.core.files import reporting
 from merl.envs import make_env
 from merl.envs.registration import ENV_IDS
 from merl.tasks import BOX_TASKS, TASKS
@@ -112,8 +112,6 @@ def _blocks(image: NDArray[np.uint8]) -> Text:
 
 
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
-    try:
+    with reporting(f"{path} cannot be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(image).save(path)
-    except OSError as error:
-        raise MerlError(f"{path} cannot be written: {error.strerror or error}") from None

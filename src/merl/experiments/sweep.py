@@ -27,7 +27,7 @@ from merl.core import (
     METRICS_FILE,
     MerlError,
 )
-from merl.core.files import read_json
+from merl.core.files import read_json, reporting
 from merl.core.signals import Interrupt
 from merl.core.watching import end_with_parent
 from merl.experiments.cloning_first import starts_cloned
@@ -293,7 +293,5 @@ def check_folder(folder: Path) -> None:
     Raises:
         MerlError: it cannot be made.
     """
-    try:
+    with reporting(f"--out {folder} cannot be created"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MerlError(f"--out {folder} cannot be created: {error.strerror}") from None

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from merl.core import MerlError
+from merl.core.files import reporting
 from merl.core.statistics import Interval, bootstrap_interval
 from merl.report.aggregates import (
     Array,
@@ -266,18 +266,15 @@ def write_table(rows: Sequence[Row], path: Path) -> None:
     """
     names = [*dict.fromkeys(name for row in rows for name in row.results)]
     ends = [f"{name}{end}" for name in names for end in ("", " low", " high", " seeds")]
-    try:
-        with path.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(["task", "variant", "seeds", "steps", "minutes", "spread", *ends])
-            for row in rows:
-                cells: list[object] = [row.group.task, row.group.label]
-                cells += [len(row.group.runs), row.steps, row.minutes.mean, row.spread]
-                for name in names:
-                    one = row.results.get(name)
-                    cells += (
-                        ["", "", "", 0] if one is None else [one.mean, one.low, one.high, one.count]
-                    )
-                writer.writerow("" if cell != cell else cell for cell in cells)  # NaN
-    except OSError as error:
-        raise MerlError(f"{path} cannot be written: {error.strerror}") from None
+    with reporting(f"{path} cannot be written"), path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["task", "variant", "seeds", "steps", "minutes", "spread", *ends])
+        for row in rows:
+            cells: list[object] = [row.group.task, row.group.label]
+            cells += [len(row.group.runs), row.steps, row.minutes.mean, row.spread]
+            for name in names:
+                one = row.results.get(name)
+                cells += (
+                    ["", "", "", 0] if one is None else [one.mean, one.low, one.high, one.count]
+                )
+            writer.writerow("" if cell != cell else cell for cell in cells)  # NaN

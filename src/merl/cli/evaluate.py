@@ -7,21 +7,19 @@ from pathlib import Path
 from typing import Annotated
 
 from merl.cli.console import make_console, say
-from merl.cli.parsing import OpenOptions, check_writable, parse, write_json
-from merl.cli.running import tell_trusted
+from merl.cli.parsing import PolicyOptions, check_writable, parse, write_json
+from merl.cli.running import open_policy
 from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.core.fields import Range
 from merl.evaluation.evaluation import EVALUATION_SEED
-from merl.evaluation.policy import load_policy
 from merl.rendering.config import RendererName
 from merl.report.references import references
-from merl.runs.run import Run
 from merl.training.live_view import describe
 
 
 @dataclass(frozen=True)
-class EvaluateOptions(OpenOptions):
+class EvaluateOptions(PolicyOptions):
     """Run a trained policy without exploration noise, from the fixed start states."""
 
     episodes: Annotated[int, Range(1)] = 10
@@ -30,8 +28,6 @@ class EvaluateOptions(OpenOptions):
     """Record a video of the first episode in this file (MP4)."""
     max_episode_steps: Annotated[int, Range(1)] | None = None
     """Steps after which an episode is cut off; by default the run's --eval.max-episode-steps."""
-    checkpoint: str = "latest"
-    """latest, best (the highest evaluation return), or the step of a checkpoint."""
     renderer: RendererName | None = None
     """Renderer of the images; by default the one that the agent was trained with."""
     json: Path | None = None
@@ -53,9 +49,7 @@ def evaluate(args: list[str]) -> int:
     json_file = options.json and options.json.absolute()
     video_file = options.video and options.video.absolute()
     console = make_console()
-    if options.trust:
-        tell_trusted(Run.open(options.run))
-    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    policy = open_policy(options)
     result = policy.evaluate(
         episodes=options.episodes,
         video=video_file,

@@ -10,16 +10,14 @@ import tyro
 from rich.filesize import decimal
 
 from merl.cli.console import make_console, say
-from merl.cli.parsing import OpenOptions, check_writable, parse
-from merl.cli.running import tell_trusted
+from merl.cli.parsing import PolicyOptions, check_writable, parse
+from merl.cli.running import open_policy
 from merl.evaluation.export import export_policy
 from merl.evaluation.exported import SUFFIXES, Form
-from merl.evaluation.policy import load_policy
-from merl.runs.run import Run
 
 
 @dataclass(frozen=True)
-class ExportOptions(OpenOptions):
+class ExportOptions(PolicyOptions):
     """Write a trained policy to one file that runs without merl."""
 
     to: Form = "onnx"
@@ -28,8 +26,6 @@ class ExportOptions(OpenOptions):
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The file; by default policy.onnx, policy.pt2 or policy.py. A card (JSON) is written
     beside it."""
-    checkpoint: str = "latest"
-    """latest, best (the highest evaluation return), or the step of a checkpoint."""
 
 
 def export(args: list[str]) -> int:
@@ -40,9 +36,7 @@ def export(args: list[str]) -> int:
         out = out.with_name(out.name + SUFFIXES[options.to])
     check_writable(out)
     console = make_console()
-    if options.trust:
-        tell_trusted(Run.open(options.run))
-    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    policy = open_policy(options)
     with console.status("exporting", spinner="line"):
         card = export_policy(policy, out, options.to)
     size, times = decimal(out.stat().st_size), card["milliseconds"]

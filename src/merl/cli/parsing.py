@@ -33,6 +33,14 @@ class OpenOptions:
         check_fields(self, "--")
 
 
+@dataclass(frozen=True)
+class PolicyOptions(OpenOptions):
+    """Options of the commands that load a policy."""
+
+    checkpoint: str = "latest"
+    """latest, best (the highest evaluation return), or the step of a checkpoint."""
+
+
 def parse(
     options: type[T],
     prog: str,

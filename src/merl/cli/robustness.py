@@ -7,24 +7,20 @@ from pathlib import Path
 from typing import Annotated
 
 from merl.cli.console import make_console, say
-from merl.cli.parsing import OpenOptions, parse
-from merl.cli.running import tell_trusted
+from merl.cli.parsing import PolicyOptions, parse
+from merl.cli.running import open_policy
 from merl.core.fields import Range
 from merl.core.files import reporting
-from merl.evaluation.policy import load_policy
 from merl.evaluation.robustness import robustness as evaluations
 from merl.report.robustness import Row, draw_rows, write_rows
-from merl.runs.run import Run
 
 
 @dataclass(frozen=True)
-class RobustnessOptions(OpenOptions):
+class RobustnessOptions(PolicyOptions):
     """Evaluate a trained policy while its senses, its actions or the scene are disturbed."""
 
     episodes: Annotated[int, Range(1)] = 50
     """Number of episodes for each disturbance."""
-    checkpoint: str = "latest"
-    """latest, best (the highest evaluation return), or the step of a checkpoint."""
     out: Path | None = None
     """Folder for robustness.csv and robustness.png; by default robustness/ and the run's name."""
 
@@ -33,9 +29,7 @@ def robustness(args: list[str]) -> int:
     """Disturb a policy: merl robustness RUN [--episodes N] [--out DIR] ..."""
     options = parse(RobustnessOptions, "merl robustness", args)
     console = make_console()
-    if options.trust:
-        tell_trusted(Run.open(options.run))
-    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    policy = open_policy(options)
     out = (options.out or Path("robustness", options.run.resolve().name)).absolute()
     with reporting(f"--out {out} cannot be created"):
         out.mkdir(parents=True, exist_ok=True)

@@ -22,8 +22,8 @@ from gymnasium import spaces
 from merl.acting.instances import own_bounds
 from merl.acting.run_env import recipe
 from merl.cli.console import make_console, say
-from merl.cli.parsing import OpenOptions, parse
-from merl.cli.running import tell_trusted
+from merl.cli.parsing import PolicyOptions, parse
+from merl.cli.running import open_policy
 from merl.core import MerlError, counted
 from merl.core.fields import Range
 from merl.core.signals import Stopped
@@ -32,11 +32,10 @@ from merl.demos.recorder import Recorder
 from merl.envs.frame_rate import frame_rate
 from merl.envs.user_env import load_module
 from merl.evaluation.exported import SUFFIXES, ExportedPolicy
-from merl.evaluation.policy import Policy, load_policy
+from merl.evaluation.policy import Policy
 from merl.evaluation.realtime import Driven, Limits, check_rate, drive
 from merl.runs import record
 from merl.runs.plain import describe, told
-from merl.runs.run import Run
 
 STOP_KEYS = b" q\x1b"
 """Space, q and Escape."""
@@ -44,7 +43,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True)
-class RunOptions(OpenOptions):
+class RunOptions(PolicyOptions):
     """Run a policy in an environment in real time, e.g. on a robot. Space or Ctrl-C stops it."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
@@ -67,8 +66,6 @@ class RunOptions(OpenOptions):
     """Consecutive steps that miss their deadline, after which the run ends."""
     log: Path | None = None
     """Write the episodes to this new folder, which `merl demos show` and training can read."""
-    checkpoint: str = "latest"
-    """latest, best (the highest evaluation return), or the step of a checkpoint."""
 
 
 def run(args: list[str]) -> int:
@@ -239,9 +236,7 @@ def _policy(options: RunOptions) -> Policy | ExportedPolicy:
         )
     if options.run.suffix in SUFFIXES.values():
         return ExportedPolicy(options.run)
-    if options.trust:
-        tell_trusted(Run.open(options.run))
-    return load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    return open_policy(options)
 
 
 def _env(options: RunOptions, policy: Policy | ExportedPolicy) -> gymnasium.Env[Any, Any]:

@@ -14,11 +14,13 @@ from rich.filesize import decimal
 from merl.acting.run_env import key_lines
 from merl.cli.console import make_console, say
 from merl.cli.duration import duration
+from merl.cli.parsing import PolicyOptions
 from merl.cli.summary import summarize
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import MerlError, counted
 from merl.core.signals import attended
 from merl.core.watching import END_SECONDS, ending
+from merl.evaluation.policy import Policy, load_policy
 from merl.experiments.cloning_first import clone_first
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint
@@ -78,6 +80,13 @@ def tell_trusted(run: Run) -> None:
     origin = run.origin()
     if origin is not None:
         print(f"merl: --trust: importing {origin}", file=sys.stderr)
+
+
+def open_policy(options: PolicyOptions) -> Policy:
+    """Load the policy that a command names; with `--trust`, print which code is imported."""
+    if options.trust:
+        tell_trusted(Run.open(options.run))
+    return load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
 
 
 def _train(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection
 from contextlib import ExitStack
+from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +15,6 @@ from rich.filesize import decimal
 
 from merl.acting.run_env import key_lines
 from merl.cli.console import make_console, say
-from merl.cli.duration import duration
 from merl.cli.parsing import PolicyOptions
 from merl.cli.summary import summarize
 from merl.config import CUSTOM, Source, TrainConfig
@@ -30,6 +31,7 @@ from merl.training.live_view import LiveView
 from merl.training.outcome import Outcome
 from merl.training.resuming import resumption
 from merl.training.setup import Setup
+from merl.training.timing import Timing
 from merl.training.trainer import Trainer
 
 DAY = 86_400.0  # seconds
@@ -193,3 +195,26 @@ def _outlook(setup: Setup, what: str, done: int) -> str:
             f"{counted(config.seed_steps, 'step')}, with --updates-per-step above 0"
         )
     return "\n".join(lines)
+
+
+def duration(config: TrainConfig, timing: Timing, done: int) -> str:
+    """Return how many steps remain and how long they take, in one line.
+
+    Args:
+        config: the config of the run.
+        timing: the measured times of a step and of an update.
+        done: steps that the run has already taken.
+    """
+    left = config.steps - done
+    steps = counted(left, "step")
+    limit = None if config.minutes is None else counted(config.minutes, "minute")
+    where = f"of {config.task} on {config.device}"
+    if not timing.knows_env:
+        bound = "" if limit is None else f" in at most {limit}"
+        return f"{steps} {where}{bound}"
+    seconds = timing.seconds(replace(config, minutes=None), done)
+    about = f"about {timedelta(seconds=round(seconds))}"
+    if config.minutes is not None and seconds > 60 * config.minutes:
+        return f"{limit} {where} ({steps} would take {about})"
+    bound = "" if limit is None else f", at most {limit}"
+    return f"{steps} {where} {'takes' if left == 1 else 'take'} {about}{bound}"

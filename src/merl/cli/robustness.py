@@ -35,8 +35,7 @@ def robustness(args: list[str]) -> int:
         out.mkdir(parents=True, exist_ok=True)
     console.print(f"{options.run} at step {policy.step:,}")
     rows: list[Row] = []
-    for each in evaluations(policy, options.episodes, trust=options.trust):
-        it, how = each.evaluation, each.disturbance
+    for how, it in evaluations(policy, options.episodes, trust=options.trust):
         row = Row.of(how.sense, how.name, len(it.episodes), it.returns, it.success_end)
         rows.append(row)
         console.print(f"{row.sense:8} {row.disturbance:14} {row.text}")

@@ -8,11 +8,25 @@ import json
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from merl.core.statistics import bootstrap_interval, wilson_interval
-from merl.experiments.small_tasks import SPLIT, optimum, returns_of
+from small_tasks import SPLIT, optimum, returns_of
 from merl.report.curves import Curve, curve_of, read_metrics
-from merl.report.figures import learning_curves, reward_terms
+from merl.report.drawing import (
+    INK,
+    LABEL_SIZE,
+    PALETTE,
+    Label,
+    direct_labels,
+    new_figure,
+    number,
+    save,
+    step_axis,
+    style,
+    value_axis,
+)
+from merl.report.figures import learning_curves
 from merl.report.references import references
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -139,10 +153,29 @@ def seeds(task: str, agent: str, preset: str) -> list[Curve]:
 
 
 def boxes() -> None:
-    """Draw the terms of the reward of the tasks with a box, from the state and mixed starts."""
-    runs = {task: DATA / f"runs/{task}-merl_state-carrying-s0.csv" for task in BOXES}
-    titles = {f"{task}, from the state, mixed starts": path for task, path in runs.items()}
-    reward_terms(titles, IMAGES / "boxes.png")
+    """Draw the terms of the reward of the tasks with a box, from the state and mixed starts.
+
+    A panel for each task, a curve for each term: its sum over an evaluation episode.
+    """
+    figure = new_figure(height=2.9 * len(BOXES))
+    labels: dict[Axes, list[Label]] = {}
+    for axes, task in zip(figure.subplots(len(BOXES), 1), BOXES, strict=True):
+        metrics = read_metrics(DATA / f"runs/{task}-merl_state-carrying-s0.csv")
+        style(axes, "sum over an episode")
+        title = f"{task}, from the state, mixed starts"
+        axes.set_title(title, loc="left", color=INK, size=LABEL_SIZE + 1, weight="bold")
+        labels[axes] = []
+        names = [name for name in metrics if name.startswith("eval/reward/")]
+        for name, color in zip(names, PALETTE, strict=False):
+            drawn = curve_of(metrics, name)
+            axes.plot(*drawn, color=color, lw=1.8)
+            last = drawn.values[-1]
+            text = f"{name.removeprefix('eval/reward/')} {number(last)}"
+            labels[axes].append(Label(text, last, color, "bold"))
+        value_axis(axes, [], False)
+        step_axis(axes, metrics["step"])
+    direct_labels(figure, labels)
+    save(figure, IMAGES / "boxes.png")
 
 
 def small_tasks() -> None:

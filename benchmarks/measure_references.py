@@ -68,10 +68,6 @@ def row(name: str, result: Evaluation) -> dict[str, object]:
         "name": name,
         "return": [round(value, 1) for value in result.returns],
         "success_end": [round(value, 3) for value in result.success_end],
-        "terms": {
-            term: round(float(np.mean([e.terms[term] for e in result.episodes])), 1)
-            for term in result.episodes[0].terms
-        },
         "source": f"{len(result.episodes)} episodes",
     }
 

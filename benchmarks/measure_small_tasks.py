@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from merl.core.statistics import bootstrap_interval
-from merl.experiments.small_tasks import CASES, WHOLE, Case, learn, optimum, returns_of
+from small_tasks import CASES, WHOLE, Case, learn, optimum, returns_of
 from merl.report.curves import read_metrics
 
 EVALUATIONS = 10  # per run; the last one is at its end

@@ -6,7 +6,6 @@ import contextlib
 import io
 import os
 import textwrap
-from dataclasses import fields, is_dataclass
 from itertools import groupby
 from typing import Any
 
@@ -16,6 +15,7 @@ from sphinx.util.docutils import SphinxDirective
 
 import merl
 from merl.cli import main
+from merl.config import flat
 from merl.experiments.presets import PRESETS, compose
 
 project = "merl"
@@ -88,16 +88,6 @@ class PresetTable(SphinxDirective):
             if name != "preset" and len(set(values)) > 1:
                 rows.append([name, *values])
         return [table(rows)]
-
-
-def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Return the fields of a config and its nested configs by dotted name."""
-    values: dict[str, Any] = {}
-    for field in fields(config):
-        value = getattr(config, field.name)
-        name = f"{prefix}{field.name}"
-        values |= flat(value, f"{name}.") if is_dataclass(value) else {name: value}
-    return values
 
 
 def shown(value: Any) -> str:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from merl.core.statistics import bootstrap_interval
-from merl.experiments.small_tasks import (
+from small_tasks import (
     CASES,
     PENDULUM,
     SPLIT,

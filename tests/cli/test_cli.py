@@ -145,6 +145,17 @@ def test_evaluate_equals_a_loop_with_load_policy(run: Path, tmp_path: Path) -> N
     env.close()
 
 
+def test_shorter_episodes_are_not_compared_with_whole_ones(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["evaluate", str(run), "--episodes", "1", "--max-episode-steps"]
+    shown = []
+    for limit in ("20", "250"):
+        assert main([*command, limit]) == 0
+        shown.append(capsys.readouterr().out)
+    assert ["scripted expert" in each for each in shown] == [False, True]
+
+
 def test_evaluating_a_hostile_folder_imports_nothing_from_it(run: Path, tmp_path: Path) -> None:
     """Evaluate one of merl's own tasks in the run's folder, which is also its module folder."""
     folder = tmp_path / "hostile"

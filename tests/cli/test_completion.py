@@ -36,6 +36,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["train", "--agent.noise-c"], ["--agent.noise-correlation", "--agent.noise-clip"]),
         (["train", "--renderer", "r"], ["raster"]),
         (["evaluate", "run", "--vi"], ["--video"]),
+        (["run", "policy.onnx", "--rate"], ["--rate-limit"]),
     ],
 )
 def test_bash_completes_commands_options_and_choices(

@@ -18,7 +18,7 @@ from merl.cli.info import _rows
 def test_info_shows_versions_processor_memory_and_renderers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("merl.bench.renderers.FRAMES", 2)
+    monkeypatch.setattr("merl.cli.info.FRAMES", 2)
     shown = dict(takewhile(lambda row: not row[0].startswith("preset"), _rows()))
     assert shown["merl"] == merl.__version__
     assert shown["mujoco"] == "3.17.0"

@@ -38,14 +38,19 @@ def test_watch_follows_runs_that_are_training(tmp_path: Path) -> None:
     write_run(folder / "reach_duplo-merl-s0", [], [])
     out = tmp_path / "out"
     command = [sys.executable, "-m", "merl.cli", "report", str(folder), "--out", str(out)]
+    command += ["--watch", "1", "--baseline", "slow"]
     process = subprocess.Popen(
-        [*command, "--watch", "1"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     assert process.stdout is not None
     assert "has no evaluation yet" in process.stdout.readline()
     write_run(folder / "reach_duplo-merl-s1", [9], [0], seed=1)
-    wait_for((out / "index.html").exists, process)
-    assert '<meta http-equiv="refresh" content="1">' in (out / "index.html").read_text()
+    page = out / "index.html"
+    wait_for(lambda: page.exists() and "is none of the curves" in page.read_text(), process)
+    assert '<meta http-equiv="refresh" content="1">' in page.read_text()
+    write_run(folder / "reach_duplo-slow-s0", [5], [0], tau=0.1)
+    wait_for(lambda: "slow against the others" in page.read_text(), process)
+    assert "is none of the curves" not in page.read_text()
     process.send_signal(signal.SIGINT)
     rest, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGINT

@@ -6,6 +6,8 @@ import fcntl
 import json
 import os
 import pty
+import shutil
+import signal
 import subprocess
 import sys
 import termios
@@ -18,9 +20,13 @@ from helpers import flat
 from merl.cli import main
 from merl.cli.run import Stop
 from merl.demos.demonstrations import Demonstrations
+from merl.runs import record
+from merl.runs.run_folder import PRETRAINED
 
 POLICY = "pretrained/reach_duplo"
 ROBOT = """
+import os
+import signal
 import time
 
 import gymnasium
@@ -62,6 +68,26 @@ def failing():
 
 def strong():
     return gymnasium.wrappers.RescaleAction(arm(), np.float32(-50), np.float32(50))
+
+class Counting(gymnasium.Wrapper):
+    def step(self, action):
+        with open("steps", "a") as file:
+            file.write(".")
+        return self.env.step(action)
+
+def counting():
+    return Counting(arm())
+
+class Deaf(Counting):
+    def step(self, action):
+        result = super().step(action)
+        if os.path.getsize("steps") == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        signal.signal(signal.SIGINT, lambda *_: None)  # as some drivers do
+        return result
+
+def deaf():
+    return Deaf(arm())
 """
 
 
@@ -72,6 +98,10 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     (tmp_path / f"{name}.py").write_text(ROBOT)
     monkeypatch.chdir(tmp_path)
     return name
+
+
+def quickly(policy: str, env: str, steps: int) -> list[str]:
+    return f"run {policy} --env {env} --hz 500 --max-late 1000 --max-steps {steps}".split()
 
 
 def test_the_log_holds_what_was_done(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,6 +121,21 @@ def test_the_log_holds_what_was_done(robot: str, capsys: pytest.CaptureFixture[s
         assert np.abs(episode.intended).max() > 0.5  # the limit had an effect
 
 
+def test_actions_are_repeated_as_in_training(robot: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(PRETRAINED / "reach_duplo", run)
+    recorded = record.read(run)
+    recorded["config"]["action_repeat"] = 2
+    record.write(run, recorded)
+    assert main(quickly("run", f"{robot}:counting", 10)) == 0
+    assert len(Path("steps").read_text()) == 20
+
+
+def test_ctrl_c_stops_an_environment_that_handles_it_itself(robot: str) -> None:
+    assert main(quickly(POLICY, f"{robot}:deaf", 50)) == 128 + 2
+    assert len(Path("steps").read_text()) == 3
+
+
 def test_an_exported_policy_runs_or_is_named(
     robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,13 +144,19 @@ def test_an_exported_policy_runs_or_is_named(
     command = ["run", "p.onnx", "--env", f"{robot}:arm", "--hz", "500", "--max-steps", "30"]
     assert main([*command, "--max-late", "1000", "--log", "log"]) == 0
     assert Demonstrations.open(Path("log")).steps == 30
+    assert main(quickly("p.onnx", "reach_duplo", 5)) == 0
     assert main(["run", "p.onnx"]) != 0
     assert "name the environment with --env" in flat(capsys.readouterr().err)
     card = tmp_path / "p.onnx.json"
     told = json.loads(card.read_text())
+    card.write_text(json.dumps(told | {"action_repeat": 2}))
+    assert main(quickly("p.onnx", f"{robot}:counting", 5)) == 0
+    assert len(Path("steps").read_text()) == 10
     for damage, words in [
         ("[]", "holds no object"),
         ("{}", "is damaged"),
+        (json.dumps(told | {"action_repeat": 0}), "is damaged"),
+        (json.dumps(told | {"env": {"image_size": 1}}), "is damaged"),
         (json.dumps(told | {"inputs": {"x": told["inputs"]["proprio"]}}), "cannot be run as its"),
         ("{", "cannot be read"),
     ]:
@@ -205,3 +256,43 @@ def test_a_stop_before_the_first_reset_moves_nothing(
     monkeypatch.setattr(Stop, "asked", lambda self: True)
     assert main(["run", POLICY, "--env", f"{robot}:failing"]) == 0
     assert "stopped before the first step" in flat(capsys.readouterr().out)
+
+
+def test_ignored_signals_stay_ignored_and_a_keyboard_may_lack(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "stdin", None)  # as after <&-
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as by nohup
+    try:
+        with Stop.listening() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop.asked()
+            assert stop.keys == "Ctrl-C"
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+BACKGROUND = """
+import os
+from merl.cli.run import Stop
+child = os.fork()
+if child == 0:
+    os.setpgid(0, 0)  # as after &
+    with Stop.listening() as stop:
+        print(stop.keys, flush=True)
+    os._exit(0)
+print("suspended" if os.WIFSTOPPED(os.waitpid(child, os.WUNTRACED)[1]) else "ended")
+"""
+
+
+def test_in_the_background_it_leaves_the_keyboard_alone() -> None:
+    _, theirs = pty.openpty()
+    done = subprocess.run(
+        [sys.executable, "-c", BACKGROUND],
+        stdin=theirs,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(theirs, termios.TIOCSCTTY, 0),
+    )
+    assert done.stdout.split() == ["Ctrl-C", "ended"]

@@ -7,13 +7,18 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from helpers import flat, wait_for
 from merl.cli import main
+from merl.config import TrainConfig
+from merl.experiments.experiment import PlannedRun
+from merl.experiments.sweep import Settings, execute
 
 TESTS = Path(__file__).parent.parent
 STEPS = 1000
@@ -135,6 +140,19 @@ def test_a_killed_run_is_resumed_and_a_failing_one_stops_no_other(
     assert evaluated(folder) == sorted(names)
     assert again.count("return ") == 2 * len(names) - len(done)  # when it ends, and in the table
     assert not any(f"{name}: done" in again for name in done)
+
+
+def test_a_run_reports_its_own_time(folder: Path) -> None:
+    command = ("nothing", "--run-dir", "mine")
+    run = PlannedRun("mine", folder / "mine", "one", TrainConfig("nothing"), command)
+    begin = time.monotonic()
+    outcome = execute(run, Settings(retries=0))
+    assert outcome.name == "mine"
+    assert "task 'nothing' is unknown" in (outcome.error or "")
+    assert 0.1 < outcome.seconds <= time.monotonic() - begin
+    (folder / "file").touch()
+    outcome = execute(replace(run, folder=folder / "file/mine"), Settings())
+    assert "it cannot be started" in (outcome.error or "")
 
 
 def test_a_signal_saves_all_runs_and_the_same_command_continues(folder: Path) -> None:

@@ -18,6 +18,7 @@ import pytest
 from merl.cli import main
 from merl.core.output import TolerantStream
 from merl.report.curves import read_metrics
+from runs_on_disk import write_run
 
 LINE = "train Pendulum-v1 --agent ddpg --preset smoke --steps 400 --random-steps 10 "
 LINE += "--seed-steps 390 --replay.batch-size 8 --agent.hidden-dim 8 --eval.episodes 1 --threads 1 "
@@ -101,6 +102,18 @@ def test_a_command_that_only_prints_reports_a_failed_write_by_its_exit_code(
     error = capsys.readouterr().err
     assert error.count("\n") == (code == 2)
     assert "Traceback" not in error
+
+
+@pytest.mark.parametrize(("broken", "code"), [(pipe_without_reader, 141), (full_disk, 2)])
+def test_a_command_that_writes_files_succeeds_with_a_broken_stream(
+    broken: Callable[[], TextIO], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = str(write_run(tmp_path / "run", [1.0], [0.0]))
+    monkeypatch.setattr(sys, "stdout", broken())
+    assert main(["report", run, "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out/index.html").exists()
+    monkeypatch.setattr(sys, "stdout", broken())
+    assert main(["compare", run, run]) == code
 
 
 def test_bad_input_has_its_exit_code_with_broken_streams(

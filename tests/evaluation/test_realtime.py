@@ -59,10 +59,10 @@ def run(robot: Robot, limits: Limits, **options: Any) -> tuple[Driven, EpisodeRe
         values["act"],
         robot,
         observation,
-        recording,
         10.0,
         limits,
         values["stop"],
+        record=recording.add,
         sleep=robot.clock.sleep,
         clock=robot.clock,
     )

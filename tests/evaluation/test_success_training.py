@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from merl.demos.episode import Episode
 from merl.demos.recorder import Recorder
 from merl.envs.learnt_success import LearntSuccess
 from merl.evaluation.demonstrating import record_episodes
-from merl.evaluation.success_training import label
+from merl.evaluation.success_training import label, save_classifier, train_classifier
 from toy import DotEnv
 
 
@@ -94,6 +95,20 @@ def test_the_environment_ends_with_the_success_that_it_sees(classifier: Path) ->
     assert results == [False] * 6 + [True]
     env.reset()
     assert not env.step(np.zeros(1))[2]
+
+
+def test_a_full_disk_is_one_line_and_keeps_the_former_file(demos: Path, tmp_path: Path) -> None:
+    data, file = label([Demonstrations.open(demos)]), tmp_path / "success.safetensors"
+    network, _ = train_classifier(data, updates=1, threshold=0.5)
+    file.write_bytes(b"former")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(MerlError, match=r"success\.safetensors cannot be written: File too"):
+            save_classifier(network, data, file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"former"]
 
 
 def test_another_environment_or_file_is_refused(classifier: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from merl.agents import AGENTS, make_agent
 from merl.config import TrainConfig
 from merl.core import MerlError
 from merl.evaluation.export import export_policy
-from merl.evaluation.exported import ExportedPolicy
+from merl.evaluation.exported import ExportedPolicy, Form
 from merl.evaluation.policy import Policy
 
 SPACE = spaces.Dict(
@@ -96,6 +96,60 @@ print(*action)
     ).stdout
     observation = {"image": np.full((24, 32, 3), 7, np.uint8), "joint": np.ones(6, np.float32)}
     np.testing.assert_allclose([float(x) for x in shown.split()], policy(observation), atol=1e-5)
+
+
+ENCODERS = """
+import torch
+from torch import nn
+
+class Plain(nn.Module):
+    def __init__(self, modality, stack):
+        super().__init__()
+        channels = stack * modality.shape[2]
+        convolution = nn.Conv2d(channels, 4, 5, 3, bias=False)
+        norm = nn.LayerNorm(10, elementwise_affine=False)
+        self.layers = nn.Sequential(convolution, norm, nn.ReLU(), nn.Flatten())
+        self.features = 4 * 7 * 10
+
+    def forward(self, pixels):
+        return self.layers(pixels)
+
+class Branching(Plain):
+    def forward(self, pixels):
+        encoded = super().forward(pixels)
+        return encoded if encoded.sum() > 1 else -encoded
+"""
+
+
+@pytest.fixture
+def encoders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the name of a module with encoders of the user's own."""
+    name = f"encoders_{abs(hash(tmp_path)) % 10**9}"
+    (tmp_path / f"{name}.py").write_text(ENCODERS)
+    monkeypatch.syspath_prepend(tmp_path)
+    return name
+
+
+def test_layers_without_bias_and_weights(encoders: str, tmp_path: Path) -> None:
+    space = spaces.Dict(image=SPACE["image"])
+    policy = make_policy("drqv2", space, encoders={"image": f"{encoders}:Plain"})
+    export_policy(policy, tmp_path / "p.py", "numpy")
+    observation = {"image": SPACE["image"].sample()}
+    exported = ExportedPolicy(tmp_path / "p.py")
+    np.testing.assert_allclose(exported(observation), policy(observation), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["onnx", "torch", "numpy"])
+def test_what_cannot_be_translated_is_one_line(form: Form, encoders: str, tmp_path: Path) -> None:
+    if form == "onnx":
+        pytest.importorskip("onnxruntime")
+    space = spaces.Dict(image=SPACE["image"])
+    policy = make_policy("drqv2", space, encoders={"image": f"{encoders}:Branching"})
+    with pytest.raises(MerlError, match=f"cannot be written as {form}: ") as caught:
+        export_policy(policy, tmp_path / "out/p", form)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+    assert not any((tmp_path / "out").iterdir())
 
 
 def test_an_operation_without_a_form_is_named(

@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,12 @@ from safetensors.torch import load_file
 import merl
 from helpers import flat, wait_for
 from merl.cli import main
+from merl.config import override
+from merl.core import MerlError
+from merl.experiments.cloning_first import starts_cloned
+from merl.experiments.experiment import PlannedRun
+from merl.experiments.sweep import is_done
+from merl.runs.run import Run
 
 TINY = ["--preset", "smoke", "--eval.every", "0", "--threads", "1", "--random-steps", "0"]
 TINY += ["--seed-steps", "100", "--agent.precision", "fp32", "--save-every", "0"]
@@ -57,6 +64,28 @@ def test_the_run_starts_with_the_cloned_policy(whole: Path) -> None:
     assert config["demos_pretrain"] == 0
     first = json.loads((whole.with_name("whole-bc") / "config.json").read_text())["config"]
     assert (first["agent_name"], first["demos_ratio"], first["steps"]) == ("bc", 1.0, 500)
+
+
+def test_a_sweep_knows_its_run_that_cloned_first(whole: Path) -> None:
+    config, cloned = Run.open(whole).config, whole.with_name("whole-bc")
+    agent = override(config.agent, {"start_from": None})
+    run = PlannedRun("whole", whole, "merl", replace(config, demos_pretrain=500, agent=agent), ())
+    assert not is_done(run, 1)  # it is not evaluated
+
+    def named(start: str) -> PlannedRun:
+        return replace(run, config=override(config, {"agent.start_from": start}))
+
+    assert not is_done(named(str(cloned)), 1)
+    with pytest.raises(MerlError, match=r"another experiment \(agent.start_from .*-bc, not x\)"):
+        is_done(named("x"), 1)
+
+
+@pytest.mark.parametrize("start", [None, Path("another-bc")])
+def test_a_run_that_was_not_cloned_first_differs_in_its_start(whole: Path, start: object) -> None:
+    found, cloned = Run.open(whole), whole.with_name("whole-bc")
+    asked = override(found.config, {"demos_pretrain": 500, "agent.start_from": None})
+    other = replace(found, config=override(found.config, {"agent.start_from": start}))
+    assert starts_cloned(asked, other).agent.start_from == cloned  # type: ignore[attr-defined]
 
 
 def test_the_same_command_continues_a_cloning_that_was_stopped(

@@ -23,6 +23,15 @@ def test_runs_that_differ_in_their_seed_are_one_group(tmp_path: Path) -> None:
     assert notes == ["reach_duplo: wide has one seed: no interval over seeds"]
 
 
+def test_seeds_that_start_with_policies_of_their_own_are_one_group(tmp_path: Path) -> None:
+    for seed, start in enumerate(("runs/a-s0-bc", "runs/a-s1-2-bc")):
+        write_run(tmp_path / f"reach_duplo-a-s{seed}", UP, RATES, seed=seed, start_from=start)
+    write_run(tmp_path / "reach_duplo-b-s0", UP, RATES, start_from="runs/a-small-bc")
+    groups, _ = collect([tmp_path])
+    labels = [(group.label, group.seeds) for group in groups]
+    assert labels == [("a", [0, 1]), ("b", [0])]
+
+
 def test_missing_seeds_are_named(tmp_path: Path) -> None:
     for seed in (0, 1, 2):
         write_run(tmp_path / f"reach_duplo-merl-s{seed}", UP, RATES, seed=seed)
@@ -46,6 +55,19 @@ def test_equal_names_are_told_apart_by_what_differs(tmp_path: Path) -> None:
     ]
     groups, _ = collect(runs)
     assert [group.label for group in groups] == ["mine (agent.tau 1)", "mine (agent.tau 2)"]
+
+
+def test_labels_have_as_many_values_as_tell_them_apart(tmp_path: Path) -> None:
+    runs = [
+        write_run(tmp_path / str(i) / "mine", UP, RATES, a=a, b=a, c=a, d=d)
+        for i, (a, d) in enumerate(((1, 5), (1, 6), (3, 5)))
+    ]
+    groups, _ = collect(runs)
+    assert [group.label for group in groups] == [
+        "mine (agent.a 1, agent.b 1, agent.c 1, agent.d 5)",
+        "mine (agent.a 1, agent.b 1, agent.c 1, agent.d 6)",
+        "mine (agent.a 3, agent.b 3, agent.c 3)",
+    ]
 
 
 def test_tasks_are_never_mixed(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from merl.core import MerlError
 from merl.report import figures
 from merl.report.curves import Curve
 from merl.report.drawing import headline, new_figure, save
-from merl.report.figures import learning_curve, learning_curves, reward_terms
+from merl.report.figures import learning_curve, learning_curves
 
 HEADER = (
     "step,time/seconds,train/return,eval/return,eval/return_low,eval/return_high,"
@@ -192,24 +192,6 @@ def test_errors_name_the_missing_data(tmp_path):
     with pytest.raises(MerlError, match="cannot be written"):
         learning_curve(run, run / "config.json" / "curve.png")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_reward_terms_have_a_panel_per_run_and_a_curve_per_term(tmp_path, drawn):
-    rows = ["step,eval/return,eval/reward/reaching,eval/reward/pushing\n"]
-    rows += [f"{1000 * i},{3 * i},{2 * i},{i}\n" for i in range(1, 31)]
-    (tmp_path / "metrics.csv").write_text("".join(rows))
-    path = reward_terms({"first": tmp_path, "second": tmp_path}, tmp_path / "terms.png")
-    assert path.is_file()
-    first, second = drawn[0].axes
-    assert [axes.get_title(loc="left") for axes in (first, second)] == ["first", "second"]
-    assert [len(axes.lines) for axes in (first, second)] == [2, 2]
-    assert {"reaching 60", "pushing 30"} <= set(words(drawn[0]))
-
-
-def test_reward_terms_refuses_a_run_without_terms(tmp_path):
-    (tmp_path / "metrics.csv").write_text("step,eval/return\n1000,2.0\n")
-    with pytest.raises(MerlError, match=r"mine: .* has no terms of a reward"):
-        reward_terms({"mine": tmp_path}, tmp_path / "terms.png")
 
 
 def test_names_are_drawn_as_they_are(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:

@@ -123,6 +123,16 @@ def test_the_same_runs_give_the_same_figures(report: Path, tmp_path: Path) -> No
     assert figures[0] == figures[1]
 
 
+def test_tasks_with_dots_have_figures_of_their_own(tmp_path: Path) -> None:
+    runs = [
+        write_run(tmp_path / name, [1, 2], [0, 0], task=f"my.arm:{name}") for name in ("one", "two")
+    ]
+    write_report(*collect(runs), tmp_path / "out")
+    figures = {path.name for path in (tmp_path / "out").glob("*.svg")}
+    names = ("return-steps", "return-minutes", "success_end-steps", "success_end-minutes")
+    assert figures == {f"my.arm-{run.name}-{name}.svg" for run in runs for name in names}
+
+
 def test_videos_beyond_the_limit_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = write_run(tmp_path / "a-s0", [1, 2, 3], [0, 0, 0])
     write_video(run / "videos/00003000.mp4")

@@ -21,7 +21,6 @@ def test_every_task_has_random_actions_no_motion_and_an_expert():
             rows[name] for name in ("random actions", "no motion", "scripted expert")
         )
         assert chance.returns.low <= chance.returns.mean <= chance.returns.high
-        assert sum(expert.terms.values()) == pytest.approx(expert.returns.mean, abs=0.3)
         assert max(chance.returns.high, still.returns.high) < expert.returns.low
         assert expert.success_end is not None
         assert expert.success_end.mean >= 0.95
@@ -33,6 +32,10 @@ def test_published_references_name_their_source():
     published = references("reach_duplo")[-1]
     assert (published.name, published.returns.mean) == ("best known: DrQ-v2", 224.6)
     assert "published" in published.source
+
+
+def test_episodes_that_are_cut_off_have_no_references():
+    assert references("reach_duplo", limit=249) == ()
 
 
 def test_a_user_task_has_no_references():

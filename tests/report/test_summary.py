@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import math
 from pathlib import Path
 
@@ -44,6 +45,15 @@ def test_results_of_a_group(two_variants: Path) -> None:
     assert late.text(",.0f") == "3,000 (2 of 3 seeds)"
     never = row_of(groups_of(two_variants)[1]).results["steps to 50% success"]
     assert never.text() == "never"
+
+
+def test_a_run_whose_metrics_have_no_row_has_the_result_of_its_evaluation(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / f"a-s{i}", [], [], seed=i, final=(5.0, 1.0)) for i in range(2)]
+    row = row_of(groups_of(tmp_path)[0])
+    assert (row.steps, row.results["final return"].mean) == (0, 5.0)
+    with (runs[0] / "lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert "a-s0 is still training: at step 0" in collect([tmp_path])[1]
 
 
 def test_one_seed_has_no_interval() -> None:

@@ -189,7 +189,7 @@ def test_a_failing_report_does_not_fail_the_run(
     def broken(*_: Any, **__: Any) -> None:
         raise MemoryError
 
-    for part in ("report.figures.learning_curve", "cli.summary.floors"):
+    for part in ("report.figures.learning_curve", "cli.summary.make_run_env"):
         monkeypatch.setattr(f"merl.{part}", broken)
     assert train("--eval.references") == 0
     printed = capsys.readouterr().out

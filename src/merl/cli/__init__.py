@@ -48,6 +48,12 @@ COMMANDS = {
 wait for torch. Its function has the command's name, its options are `TrainOptions` etc."""
 
 
+TRAINING = ("train", "resume", "learner", "actor")
+"""The commands whose environments and threads may keep the process from ending."""
+WORKING = (*TRAINING, "run", "export", "robustness", "demos", "classifier", "sweep", "report")
+"""The commands that do more than print."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code.
 
@@ -57,18 +63,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is not None:
         return _main(arguments)
     code = _main(sys.argv[1:])
-    if not _only_prints(sys.argv[1:]):
+    if sys.argv[1:] and sys.argv[1] in TRAINING:
         end_soon(code)
     return code
 
 
-def _only_prints(args: Sequence[str]) -> bool:
-    return args[:1] not in (["train"], ["resume"], ["learner"], ["actor"])
-
-
 def _main(arguments: Sequence[str]) -> int:
     args = list(arguments)
-    only_prints = _only_prints(args)
+    only_prints = not args or args[0] not in WORKING or args[:2] == ["demos", "show"]
     try:
         with tolerant_output() as (out, _), working_folder_hidden(), _warnings_on_stderr():
             code = _run(args)

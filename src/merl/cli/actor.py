@@ -15,7 +15,7 @@ from rich.console import Console
 
 from merl.acting.instances import own_bounds
 from merl.acting.run_env import make_run_env, run_spaces
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import parse
 from merl.cli.run import Stop
 from merl.config import ActorsConfig, TrainConfig
@@ -93,7 +93,7 @@ def actor(args: list[str]) -> int:
         )
         rate = "" if options.hz is None else f" at {options.hz:g} steps per second"
         name = f"actor {connection.place} of {address} in {config.task}"
-        console.print(f"{name}{rate}: {stop.keys} stops", highlight=False, soft_wrap=True)
+        say(console, f"{name}{rate}: {stop.keys} stops")
         code = _act(options, acting, connection, console)
         connection.close()
         _tell_end(connection, spool, console)
@@ -108,12 +108,11 @@ def _act(options: ActorOptions, acting: Actor, connection: Connection, console: 
             told = time.monotonic()
             success = {None: "", True: ", success", False: ", no success"}[episode.success]
             late = "" if options.hz is None else f"; {driven.timing.late} late"
-            console.print(
+            say(
+                console,
                 f"episode {number}: return {episode.total_reward:.4g} in "
                 f"{counted(episode.length, 'step')}{success}{late}; "
                 f"policy of update {acting.policy:,} of {connection.updates:,}",
-                highlight=False,
-                soft_wrap=True,
             )
         if driven.end == "late":
             steps = counted(options.max_late, "step")
@@ -129,7 +128,7 @@ def _tell_end(connection: Connection, spool: Spool, console: Console) -> None:
     elif spool.last > connection.stored:
         count = counted(spool.last - connection.stored, "timestep")
         line = f"{count} will be sent when an actor starts again with --spool {spool.folder}"
-        console.print(line, highlight=False, soft_wrap=True)
+        say(console, line)
 
 
 def _pace(options: ActorOptions) -> Pace:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import check_writable, parse
 from merl.core import MerlError
 from merl.core.fields import NOT_EMPTY, Range, check_fields
@@ -54,11 +54,10 @@ def classifier(args: list[str]) -> int:
             data, updates=options.updates, threshold=options.threshold, seed=options.seed
         )
     save_classifier(network, data, options.out)
-    console.print(
+    say(
+        console,
         f"{options.out}: sees success in {report.found:,} of {report.solved:,} images with it, and "
         f"in {report.alarms:,} of {report.others:,} without it (episodes that it was not trained "
         f"on, threshold {options.threshold:g})",
-        highlight=False,
-        soft_wrap=True,
     )
     return 0

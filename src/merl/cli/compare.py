@@ -42,7 +42,7 @@ def compare(args: list[str]) -> int:
     for name, *values in _results(runs):
         table.add_row(name, *values)
     console = make_console()
-    console.print(table, highlight=False)
+    console.print(table)
     if not differing:
         console.print("config, versions and machine are the same")
     return 0
@@ -66,15 +66,7 @@ def _results(runs: list[SeedRun]) -> list[tuple[str, ...]]:
         row_of(Group(run.label, run.task, (run,))) if known else None
         for run, known in zip(runs, have, strict=True)
     ]
-    lines = [
-        (
-            "step",
-            *(
-                f"{int(run.metrics['step'][-1]):,}" if len(run.metrics["step"]) else "0"
-                for run in runs
-            ),
-        )
-    ]
+    lines = [("step", *(f"{run.last_step:,}" for run in runs))]
     for name, what in (("final return", RETURN), ("final success", SUCCESS)):
         values = [run.final(what) for run in runs]
         form = ".0%" if what == SUCCESS else ".4g"

@@ -14,3 +14,8 @@ def make_console() -> Console:
     if not console.is_terminal:
         console.width = UNWRAPPED
     return console
+
+
+def say(console: Console, line: str, style: str | None = None) -> None:
+    """Print a line without line breaks of its own, so that paths and commands can be copied."""
+    console.print(line, soft_wrap=True, style=style)

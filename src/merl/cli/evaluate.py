@@ -6,22 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from merl.cli.console import make_console
-from merl.cli.parsing import RunOptions, check_writable, parse, write_json
-from merl.cli.running import tell_trusted
+from merl.cli.console import make_console, say
+from merl.cli.parsing import PolicyOptions, check_writable, parse, write_json
+from merl.cli.running import open_policy
 from merl.cli.summary import comparison
 from merl.core import MerlError
 from merl.core.fields import Range
 from merl.evaluation.evaluation import EVALUATION_SEED
-from merl.evaluation.policy import load_policy
 from merl.rendering.config import RendererName
 from merl.report.references import references
-from merl.runs.run import Run
 from merl.training.live_view import describe
 
 
 @dataclass(frozen=True)
-class EvaluateOptions(RunOptions):
+class EvaluateOptions(PolicyOptions):
     """Run a trained policy without exploration noise, from the fixed start states."""
 
     episodes: Annotated[int, Range(1)] = 10
@@ -30,8 +28,6 @@ class EvaluateOptions(RunOptions):
     """Record a video of the first episode in this file (MP4)."""
     max_episode_steps: Annotated[int, Range(1)] | None = None
     """Steps after which an episode is cut off; by default the run's --eval.max-episode-steps."""
-    checkpoint: str = "latest"
-    """latest, best (the highest evaluation return), or the step of a checkpoint."""
     renderer: RendererName | None = None
     """Renderer of the images; by default the one that the agent was trained with."""
     json: Path | None = None
@@ -53,9 +49,7 @@ def evaluate(args: list[str]) -> int:
     json_file = options.json and options.json.absolute()
     video_file = options.video and options.video.absolute()
     console = make_console()
-    if options.trust:
-        tell_trusted(Run.open(options.run))
-    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    policy = open_policy(options)
     result = policy.evaluate(
         episodes=options.episodes,
         video=video_file,
@@ -67,12 +61,13 @@ def evaluate(args: list[str]) -> int:
     renderer = options.renderer or policy.config.env.renderer
     images = "" if policy.config.has_user_env else f", {renderer} images"
     line = f"{options.run} at step {policy.step:,}{images}: {describe(result)}"
-    console.print(line, highlight=False)
-    known = references(config.task, config.evaluated.env)
+    console.print(line)
+    limit = options.max_episode_steps or config.eval.max_episode_steps
+    known = references(config.task, config.evaluated.env, limit)
     if known:
-        console.print(comparison(config.task, result, known), highlight=False)
+        console.print(comparison(config.task, result, known))
     if options.video is not None:
-        console.print(f"video: {options.video}", highlight=False, soft_wrap=True)
+        say(console, f"video: {options.video}")
     if json_file is not None:
         rows = [
             {

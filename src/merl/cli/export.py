@@ -9,17 +9,15 @@ from typing import Annotated
 import tyro
 from rich.filesize import decimal
 
-from merl.cli.console import make_console
-from merl.cli.parsing import RunOptions, check_writable, parse
-from merl.cli.running import tell_trusted
+from merl.cli.console import make_console, say
+from merl.cli.parsing import PolicyOptions, check_writable, parse
+from merl.cli.running import open_policy
 from merl.evaluation.export import export_policy
 from merl.evaluation.exported import SUFFIXES, Form
-from merl.evaluation.policy import load_policy
-from merl.runs.run import Run
 
 
 @dataclass(frozen=True)
-class ExportOptions(RunOptions):
+class ExportOptions(PolicyOptions):
     """Write a trained policy to one file that runs without merl."""
 
     to: Form = "onnx"
@@ -28,8 +26,6 @@ class ExportOptions(RunOptions):
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The file; by default policy.onnx, policy.pt2 or policy.py. A card (JSON) is written
     beside it."""
-    checkpoint: str = "latest"
-    """latest, best (the highest evaluation return), or the step of a checkpoint."""
 
 
 def export(args: list[str]) -> int:
@@ -40,20 +36,17 @@ def export(args: list[str]) -> int:
         out = out.with_name(out.name + SUFFIXES[options.to])
     check_writable(out)
     console = make_console()
-    if options.trust:
-        tell_trusted(Run.open(options.run))
-    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    policy = open_policy(options)
     with console.status("exporting", spinner="line"):
         card = export_policy(policy, out, options.to)
     size, times = decimal(out.stat().st_size), card["milliseconds"]
-    console.print(
+    say(
+        console,
         f"{out}: {size}; an action takes {times['p50']} ms (99 %: {times['p99']} ms) on one thread",
-        highlight=False,
-        soft_wrap=True,
     )
     for kind in ("inputs", "outputs"):
         for name, told in card[kind].items():
             shape = tuple(told["shape"])
-            console.print(f"  {kind[:-1]} {name}: {told['dtype']} {shape}", highlight=False)
-    console.print(f"card: {out}.json", highlight=False, soft_wrap=True)
+            console.print(f"  {kind[:-1]} {name}: {told['dtype']} {shape}")
+    say(console, f"card: {out}.json")
     return 0

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class OpenOptions:
     """Options of the commands that open a run."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -31,6 +31,14 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         check_fields(self, "--")
+
+
+@dataclass(frozen=True)
+class PolicyOptions(OpenOptions):
+    """Options of the commands that load a policy."""
+
+    checkpoint: str = "latest"
+    """latest, best (the highest evaluation return), or the step of a checkpoint."""
 
 
 def parse(

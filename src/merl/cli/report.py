@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import parse
 from merl.core import MerlError, counted, suggest
 from merl.core.fields import Range, check_fields
@@ -63,21 +63,19 @@ def _report(options: ReportOptions, console: Console, before: list[str]) -> list
         if options.watch is None:
             raise
         groups, notes = [], [str(error)]  # the first evaluation may still come
+    labels, wrong = sorted({group.label for group in groups}), None
+    if options.baseline is not None and groups and options.baseline not in labels:
+        hint = suggest(options.baseline, labels)
+        wrong = f"--baseline {options.baseline!r} is none of the curves: {hint}"
+        notes += [wrong] if options.watch else []  # as above
     for note in notes:
         if note not in before:
-            console.print(note, highlight=False, soft_wrap=True)
-    if options.baseline is not None and groups:
-        labels = sorted({group.label for group in groups})
-        if options.baseline not in labels:
-            hint = suggest(options.baseline, labels)
-            raise MerlError(f"--baseline {options.baseline!r} is none of the curves: {hint}")
-        groups.sort(key=lambda group: group.label != options.baseline)
+            say(console, note)
+    if wrong is not None and options.watch is None:
+        raise MerlError(wrong)
+    groups.sort(key=lambda group: group.label != options.baseline)
     if groups:
         page = write_report(groups, notes, options.out, options.title, options.watch)
         runs = sum(len(group.runs) for group in groups)
-        console.print(
-            f"{page}: {counted(runs, 'run')}, {counted(len(groups), 'curve')}",
-            highlight=False,
-            soft_wrap=True,
-        )
+        say(console, f"{page}: {counted(runs, 'run')}, {counted(len(groups), 'curve')}")
     return notes

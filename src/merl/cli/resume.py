@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from merl.cli.parsing import RunOptions, parse
+from merl.cli.parsing import OpenOptions, parse
 from merl.cli.running import Damaged, go_on, tell_trusted
 from merl.config import Device
 from merl.core.fields import Range
@@ -14,7 +14,7 @@ from merl.runs.run import Run
 
 
 @dataclass(frozen=True)
-class ResumeOptions(RunOptions):
+class ResumeOptions(OpenOptions):
     """Resume a run from its last checkpoint."""
 
     steps: Annotated[int, Range(1)] | None = None

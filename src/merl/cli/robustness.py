@@ -6,25 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from merl.cli.console import make_console
-from merl.cli.parsing import RunOptions, parse
-from merl.cli.running import tell_trusted
-from merl.core import MerlError
+from merl.cli.console import make_console, say
+from merl.cli.parsing import PolicyOptions, parse
+from merl.cli.running import open_policy
 from merl.core.fields import Range
-from merl.evaluation.policy import load_policy
+from merl.core.files import reporting
 from merl.evaluation.robustness import robustness as evaluations
 from merl.report.robustness import Row, draw_rows, write_rows
-from merl.runs.run import Run
 
 
 @dataclass(frozen=True)
-class RobustnessOptions(RunOptions):
+class RobustnessOptions(PolicyOptions):
     """Evaluate a trained policy while its senses, its actions or the scene are disturbed."""
 
     episodes: Annotated[int, Range(1)] = 50
     """Number of episodes for each disturbance."""
-    checkpoint: str = "latest"
-    """latest, best (the highest evaluation return), or the step of a checkpoint."""
     out: Path | None = None
     """Folder for robustness.csv and robustness.png; by default robustness/ and the run's name."""
 
@@ -33,22 +29,17 @@ def robustness(args: list[str]) -> int:
     """Disturb a policy: merl robustness RUN [--episodes N] [--out DIR] ..."""
     options = parse(RobustnessOptions, "merl robustness", args)
     console = make_console()
-    if options.trust:
-        tell_trusted(Run.open(options.run))
-    policy = load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    policy = open_policy(options)
     out = (options.out or Path("robustness", options.run.resolve().name)).absolute()
-    try:
+    with reporting(f"--out {out} cannot be created"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MerlError(f"--out {out} cannot be created: {error.strerror}") from None
-    console.print(f"{options.run} at step {policy.step:,}", highlight=False)
+    console.print(f"{options.run} at step {policy.step:,}")
     rows: list[Row] = []
-    for each in evaluations(policy, options.episodes, trust=options.trust):
-        it, how = each.evaluation, each.disturbance
+    for how, it in evaluations(policy, options.episodes, trust=options.trust):
         row = Row.of(how.sense, how.name, len(it.episodes), it.returns, it.success_end)
         rows.append(row)
-        console.print(f"{row.sense:8} {row.disturbance:14} {row.text}", highlight=False)
+        console.print(f"{row.sense:8} {row.disturbance:14} {row.text}")
         write_rows(rows, out / "robustness.csv")
     figure = draw_rows(rows, f"{policy.config.task} under disturbances", out / "robustness.png")
-    console.print(f"{figure}", highlight=False, soft_wrap=True)
+    say(console, f"{figure}")
     return 0

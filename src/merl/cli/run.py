@@ -10,7 +10,7 @@ import termios
 import tty
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,25 +18,24 @@ import gymnasium
 import numpy as np
 import tyro
 from gymnasium import spaces
-from rich.console import Console
 
 from merl.acting.instances import own_bounds
-from merl.cli.console import make_console
-from merl.cli.parsing import RunOptions, parse
-from merl.cli.running import tell_trusted
+from merl.acting.run_env import recipe
+from merl.cli.console import make_console, say
+from merl.cli.parsing import PolicyOptions, parse
+from merl.cli.running import open_policy
 from merl.core import MerlError, counted
 from merl.core.fields import Range
 from merl.core.signals import Stopped
 from merl.demos.episode import Episode, EpisodeRecording
 from merl.demos.recorder import Recorder
 from merl.envs.frame_rate import frame_rate
-from merl.envs.user_env import load_module, make_user_env
+from merl.envs.user_env import load_module
 from merl.evaluation.exported import SUFFIXES, ExportedPolicy
-from merl.evaluation.policy import Policy, load_policy
+from merl.evaluation.policy import Policy
 from merl.evaluation.realtime import Driven, Limits, check_rate, drive
 from merl.runs import record
 from merl.runs.plain import describe, told
-from merl.runs.run import Run
 
 STOP_KEYS = b" q\x1b"
 """Space, q and Escape."""
@@ -44,13 +43,14 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True)
-class RunPolicyOptions(RunOptions):
+class RunOptions(PolicyOptions):
     """Run a policy in an environment in real time, e.g. on a robot. Space or Ctrl-C stops it."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     """A run's folder, or a file of `merl export`."""
     env: Annotated[str | None, tyro.conf.arg(metavar="MODULE:FUNCTION")] = None
-    """The environment: module:function or a Gymnasium id; by default that of the run."""
+    """The environment: module:function, a Gymnasium id or a task of merl; by default that of the
+    run."""
     hz: Annotated[float, Range(0, 10_000, without=0)] | None = None
     """Steps per second; by default the environment's `render_fps`."""
     episodes: Annotated[int, Range(1)] = 1
@@ -66,13 +66,11 @@ class RunPolicyOptions(RunOptions):
     """Consecutive steps that miss their deadline, after which the run ends."""
     log: Path | None = None
     """Write the episodes to this new folder, which `merl demos show` and training can read."""
-    checkpoint: str = "latest"
-    """latest, best (the highest evaluation return), or the step of a checkpoint."""
 
 
 def run(args: list[str]) -> int:
     """Run a policy in real time: merl run POLICY [--env MODULE:FUNCTION] [--hz RATE] ..."""
-    options = parse(RunPolicyOptions, "merl run", args)
+    options = parse(RunOptions, "merl run", args)
     console = make_console()
     log = options.log and options.log.absolute()  # the environment may change the working folder
     policy = _policy(options)
@@ -93,7 +91,7 @@ def run(args: list[str]) -> int:
             recorder = Recorder(log, name, who, env.observation_space, env.action_space)
         policy(env.observation_space.sample())  # the first call takes longer
         stop = stack.enter_context(Stop.listening())
-        _tell(console, f"{options.run} in {name}, {rate:g} steps per second: {stop.keys} stops")
+        say(console, f"{options.run} in {name}, {rate:g} steps per second: {stop.keys} stops")
         code = acted = 0
         for index in range(options.episodes):
             if stop.asked():
@@ -103,7 +101,9 @@ def run(args: list[str]) -> int:
             policy.reset()
             recording, terminated = EpisodeRecording(observation), False
             try:
-                found = drive(policy, env, observation, recording, rate, limits, stop.asked)
+                found = drive(
+                    policy, env, observation, rate, limits, stop.asked, record=recording.add
+                )
                 terminated = found.end == "terminated"
             finally:  # also after an error, whose episode is the most interesting
                 if recorder is not None and len(recording):
@@ -111,16 +111,16 @@ def run(args: list[str]) -> int:
             acted += len(recording)
             if len(recording):
                 episode = recording.finish(terminated=terminated)
-                _tell(console, f"episode {index + 1}: {_told(episode, found)}")
+                say(console, f"episode {index + 1}: {_told(episode, found)}")
             if found.end == "late":
                 message = f"{counted(options.max_late, 'step')} in a row missed the deadline"
-                _tell(console, f"stopped: {message}: use a lower --hz")
+                say(console, f"stopped: {message}: use a lower --hz")
                 code = 1
                 break
         if not acted:
-            _tell(console, "stopped before the first step")
+            say(console, "stopped before the first step")
         if recorder is not None and recorder.demonstrations.lines:
-            _tell(console, f"log: {log}")
+            say(console, f"log: {log}")
     return 128 + stop.number if stop.number else code
 
 
@@ -139,10 +139,11 @@ class Stop:
     @classmethod
     @contextmanager
     def listening(cls) -> Iterator[Stop]:
-        """Listen to signals, and to the keys of the terminal if there is one."""
-        terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
+        """Listen to signals that are not ignored, as by nohup, and to the keys of the terminal."""
+        terminal = _keyboard()
         stop = cls(terminal)
-        former = {number: signal.signal(number, stop.note) for number in SIGNALS}
+        heard = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+        former = {number: signal.signal(number, stop.note) for number in heard}
         before = None if terminal is None else termios.tcgetattr(terminal)
         try:
             if terminal is not None:
@@ -176,6 +177,15 @@ class Stop:
             keys = os.read(self._terminal, 4096)
             self._pressed |= not keys or any(key in STOP_KEYS for key in keys)
         return self._pressed or self.number != 0
+
+
+def _keyboard() -> int | None:
+    """Return the terminal whose keys this process gets; None without one and in the background."""
+    with suppress(AttributeError, OSError, ValueError):  # no stdin, a closed one, no terminal
+        terminal = sys.stdin.fileno()
+        if os.tcgetpgrp(terminal) == os.getpgrp():
+            return terminal
+    return None
 
 
 def check_fits(policy: Policy | ExportedPolicy, env: gymnasium.Env[Any, Any]) -> None:
@@ -218,7 +228,7 @@ def check_fits(policy: Policy | ExportedPolicy, env: gymnasium.Env[Any, Any]) ->
         )
 
 
-def _policy(options: RunPolicyOptions) -> Policy | ExportedPolicy:
+def _policy(options: RunOptions) -> Policy | ExportedPolicy:
     if options.run.suffix == SUFFIXES["numpy"]:
         raise MerlError(
             f"{options.run} is Python code: import its Policy into a program of your own, or "
@@ -226,29 +236,23 @@ def _policy(options: RunPolicyOptions) -> Policy | ExportedPolicy:
         )
     if options.run.suffix in SUFFIXES.values():
         return ExportedPolicy(options.run)
-    if options.trust:
-        tell_trusted(Run.open(options.run))
-    return load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+    return open_policy(options)
 
 
-def _env(options: RunPolicyOptions, policy: Policy | ExportedPolicy) -> gymnasium.Env[Any, Any]:
-    if options.env is not None:
-        if ":" in options.env:
-            load_module(options.env, Path.cwd())
-        known = policy.config.user_env if isinstance(policy, Policy) else None
-        return make_user_env(options.env, config=known)
-    if isinstance(policy, ExportedPolicy):
-        raise MerlError(f"{options.run} is a file of a policy: name the environment with --env")
-    return policy.make_env(trust=options.trust)
+def _env(options: RunOptions, policy: Policy | ExportedPolicy) -> gymnasium.Env[Any, Any]:
+    if options.env is None:
+        if isinstance(policy, ExportedPolicy):
+            raise MerlError(f"{options.run} is a file of a policy: name the environment with --env")
+        return policy.make_env(trust=options.trust)
+    if ":" in options.env:
+        load_module(options.env, Path.cwd())
+    known = policy.recipe if isinstance(policy, ExportedPolicy) else recipe(policy.config.evaluated)
+    return replace(known, task=options.env).instance()
 
 
 def _task(policy: Policy | ExportedPolicy) -> str:
     assert isinstance(policy, Policy)
     return policy.config.task
-
-
-def _tell(console: Console, line: str) -> None:
-    console.print(line, highlight=False, soft_wrap=True)
 
 
 def _told(episode: Episode, found: Driven) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection
 from contextlib import ExitStack
+from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Literal
 
@@ -12,13 +14,14 @@ from rich.console import Console
 from rich.filesize import decimal
 
 from merl.acting.run_env import key_lines
-from merl.cli.console import make_console
-from merl.cli.duration import duration
+from merl.cli.console import make_console, say
+from merl.cli.parsing import PolicyOptions
 from merl.cli.summary import summarize
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import MerlError, counted
 from merl.core.signals import attended
 from merl.core.watching import END_SECONDS, ending
+from merl.evaluation.policy import Policy, load_policy
 from merl.experiments.cloning_first import clone_first
 from merl.report.references import EXPERT, RANDOM, references
 from merl.runs.checkpoint import Checkpoint
@@ -28,6 +31,7 @@ from merl.training.live_view import LiveView
 from merl.training.outcome import Outcome
 from merl.training.resuming import resumption
 from merl.training.setup import Setup
+from merl.training.timing import Timing
 from merl.training.trainer import Trainer
 
 DAY = 86_400.0  # seconds
@@ -80,6 +84,13 @@ def tell_trusted(run: Run) -> None:
         print(f"merl: --trust: importing {origin}", file=sys.stderr)
 
 
+def open_policy(options: PolicyOptions) -> Policy:
+    """Load the policy that a command names; with `--trust`, print which code is imported."""
+    if options.trust:
+        tell_trusted(Run.open(options.run))
+    return load_policy(options.run, checkpoint=options.checkpoint, trust=options.trust)
+
+
 def _train(
     config: TrainConfig,
     what: str,
@@ -98,13 +109,13 @@ def _train(
     if outcome.signal is not None:
         outcome.check_saved()
         console.print(f"stopped at step {outcome.progress.step:,} and saved: resume with")
-        console.print(f"    {resume_line(folder)}", highlight=False, soft_wrap=True)
+        say(console, f"    {resume_line(folder)}")
         return 128 + outcome.signal
     try:
         summarize(outcome, console)
     except KeyboardInterrupt:
         outcome.check_saved()
-        console.print(f"{folder} is trained and saved", highlight=False, soft_wrap=True)
+        say(console, f"{folder} is trained and saved")
         raise
     outcome.check_saved()
     return 0
@@ -128,7 +139,7 @@ def _fit(
             )
             stack.enter_context(trainer)
         done = resumed[1].step if resumed and resumed[1] else 0
-        console.print(_outlook(trainer.setup, what, done), highlight=False)
+        console.print(_outlook(trainer.setup, what, done))
         seconds = trainer.setup.timing.seconds(trainer.config)
         if resumed is None and source.preset != "laptop" and seconds > DAY:
             console.print("that is more than a day: --preset laptop is made for such a machine")
@@ -158,11 +169,8 @@ def _end(outcome: Outcome) -> tuple[int, str]:
 
 def _scale(config: TrainConfig) -> dict[str, float]:
     """Return the reference returns for the live view; none for an unknown environment."""
-    return {
-        reference.name: reference.returns.mean
-        for reference in references(config.task, config.evaluated.env)
-        if reference.name in (RANDOM, EXPERT)
-    }
+    known = references(config.task, config.evaluated.env, config.eval.max_episode_steps)
+    return {row.name: row.returns.mean for row in known if row.name in (RANDOM, EXPERT)}
 
 
 def _outlook(setup: Setup, what: str, done: int) -> str:
@@ -187,3 +195,26 @@ def _outlook(setup: Setup, what: str, done: int) -> str:
             f"{counted(config.seed_steps, 'step')}, with --updates-per-step above 0"
         )
     return "\n".join(lines)
+
+
+def duration(config: TrainConfig, timing: Timing, done: int) -> str:
+    """Return how many steps remain and how long they take, in one line.
+
+    Args:
+        config: the config of the run.
+        timing: the measured times of a step and of an update.
+        done: steps that the run has already taken.
+    """
+    left = config.steps - done
+    steps = counted(left, "step")
+    limit = None if config.minutes is None else counted(config.minutes, "minute")
+    where = f"of {config.task} on {config.device}"
+    if not timing.knows_env:
+        bound = "" if limit is None else f" in at most {limit}"
+        return f"{steps} {where}{bound}"
+    seconds = timing.seconds(replace(config, minutes=None), done)
+    about = f"about {timedelta(seconds=round(seconds))}"
+    if config.minutes is not None and seconds > 60 * config.minutes:
+        return f"{limit} {where} ({steps} would take {about})"
+    bound = "" if limit is None else f", at most {limit}"
+    return f"{steps} {where} {'takes' if left == 1 else 'take'} {about}{bound}"

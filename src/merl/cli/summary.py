@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from merl.acting.run_env import make_run_env
+from merl.cli.console import say
 from merl.config import TrainConfig
 from merl.core import counted
 from merl.core.files import entries
@@ -22,6 +23,8 @@ from merl.training.outcome import Outcome
 
 FLOORS = (RANDOM, "no motion")
 """References that need no skill."""
+EPISODES = 20
+"""Episodes in which they are measured, if they are not known."""
 ENOUGH = 5
 """Fewest evaluation episodes that can show that the agent has learnt."""
 
@@ -31,64 +34,58 @@ def summarize(outcome: Outcome, console: Console) -> None:
 
     The run is already saved. If a part of the summary fails, print one line and continue.
     """
-    run, trained = outcome.run, outcome.evaluation
+    run, trained, config = outcome.run, outcome.evaluation, outcome.run.config
     from merl.report.figures import learning_curve  # Matplotlib imports slowly
 
-    known = references(run.config.task, run.config.evaluated.env)
-    if trained is not None and not known and run.config.eval.references:
+    known = references(config.task, config.evaluated.env, config.eval.max_episode_steps)
+    if trained is not None and not known and config.eval.references:
         with console.status(f"measuring returns of {' and '.join(FLOORS)}", spinner="line"):
-            known = _measured(run.config, console, trained.success_end is not None)
+            known = _floors(config, console, trained.success_end is not None)
     if trained is not None:
         console.print()
-        console.print(comparison(run.config.task, trained, known))
+        console.print(comparison(config.task, trained, known))
     lines = {reference.name: reference.returns.mean for reference in known}
     try:
         curve = learning_curve(run.path, run.path / "curve.png", references=lines)
-        console.print(f"learning curve: {curve}", highlight=False, soft_wrap=True)
+        say(console, f"learning curve: {curve}")
     except Exception as error:  # Matplotlib's errors too
-        console.print(f"the curve was not drawn: {reason(error)}", highlight=False)
+        console.print(f"the curve was not drawn: {reason(error)}")
     videos: list[Path] = []
     with suppress(OSError):
         videos = [path for path in entries(run.videos) if path.suffix == ".mp4"]
     if videos:
-        console.print(f"video: {videos[-1]}", highlight=False, soft_wrap=True)
+        say(console, f"video: {videos[-1]}")
     if trained is not None:
-        console.print(_verdict(known, trained, outcome.progress.updates), highlight=False)
+        console.print(_verdict(known, trained, outcome.progress.updates))
     elif outcome.saved:
-        console.print(
-            f"{run.path} is trained and saved, and not evaluated", highlight=False, soft_wrap=True
-        )
-    console.print(_resume_hint(outcome), highlight=False, soft_wrap=True)
-    console.print(
-        f"(its replay, {run.replay}, is only needed to resume; you may delete it otherwise)",
-        highlight=False,
-        soft_wrap=True,
-        style="dim",
-    )
+        say(console, f"{run.path} is trained and saved, and not evaluated")
+    say(console, _resume_hint(outcome))
+    replay = f"(its replay, {run.replay}, is only needed to resume; you may delete it otherwise)"
+    say(console, replay, style="dim")
 
 
-def floors(
-    config: TrainConfig, episodes: int = 20, *, reports_success: bool = False
-) -> tuple[Reference, ...]:
-    """Measure random actions and no motion (the middle of the range) from the fixed starts."""
-    env = make_run_env(config.evaluated)
-    rng = np.random.default_rng(0)
-    shape = env.action_space.shape
-    assert shape is not None
-    policies: tuple[Act, Act] = (
-        lambda _: rng.uniform(-1.0, 1.0, shape).astype(np.float32),
-        lambda _: np.zeros(shape, np.float32),
-    )
+def _floors(config: TrainConfig, console: Console, reports_success: bool) -> tuple[Reference, ...]:
+    """Measure `FLOORS` from the fixed starts; if that fails, print one line and return none.
+
+    No motion is the middle of the actions' range.
+    """
+    rng, limit = np.random.default_rng(0), config.eval_steps
     try:
-        limit = config.eval_steps
-        results = [
-            evaluate(act, env, episodes, max_steps=limit, reports_success=reports_success)
-            for act in policies
-        ]
-    finally:
-        env.close()
+        with closing(make_run_env(config.evaluated)) as env:
+            shape = env.action_space.shape or ()
+            policies: tuple[Act, Act] = (
+                lambda _: rng.uniform(-1.0, 1.0, shape).astype(np.float32),
+                lambda _: np.zeros(shape, np.float32),
+            )
+            results = [
+                evaluate(act, env, EPISODES, max_steps=limit, reports_success=reports_success)
+                for act in policies
+            ]
+    except Exception as error:
+        console.print(f"there is nothing to compare with: {reason(error)}")
+        return ()
     return tuple(
-        Reference(name, result.returns, result.success_end, counted(episodes, "episode"))
+        Reference(name, result.returns, result.success_end, counted(EPISODES, "episode"))
         for name, result in zip(FLOORS, results, strict=True)
     )
 
@@ -108,17 +105,6 @@ def comparison(task: str, trained: Evaluation, known: Sequence[Reference]) -> Ta
         table.add_row(row.name, returns, success, row.source, style=style)
     table.caption = "in brackets: 95 % intervals"
     return table
-
-
-def _measured(
-    config: TrainConfig, console: Console, reports_success: bool
-) -> tuple[Reference, ...]:
-    """Return the measured `FLOORS`; if that fails, print one line and return none."""
-    try:
-        return floors(config, reports_success=reports_success)
-    except Exception as error:
-        console.print(f"there is nothing to compare with: {reason(error)}", highlight=False)
-        return ()
 
 
 def _verdict(known: Sequence[Reference], trained: Evaluation, updates: int) -> str:

@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import check_writable, parse
 from merl.core import MerlError, check_choice, counted, suggest
 from merl.core.fields import NOT_EMPTY, Range, check_fields
@@ -107,7 +107,7 @@ def sweep(args: list[str]) -> int:
     settings = Settings(_threads(options), options.episodes, options.retries)
     missing = [run for run in runs if not is_done(run, settings.episodes)]
     counts = f"{counted(len(runs), 'run')} in {out}, {len(runs) - len(missing)} done"
-    console.print(f"{experiment.title}: {counts}", highlight=False, soft_wrap=True)
+    say(console, f"{experiment.title}: {counts}")
     if options.dry_run:
         _list(console, runs, settings, options.jobs)
         return 0
@@ -117,7 +117,7 @@ def sweep(args: list[str]) -> int:
             return 0
         check_folder(out)
         write_array(options.slurm, missing, settings, options.cpus, options.gpus)
-        console.print(f"sbatch {options.slurm}", highlight=False, soft_wrap=True)
+        say(console, f"sbatch {options.slurm}")
         return 0
     check_folder(out)
     stopped, failed = _run(console, missing, settings, options) if missing else (None, {})
@@ -156,12 +156,12 @@ def _run(
     last = time.monotonic()
     by_name = {run.name: run for run in runs}
 
-    def say(text: str) -> None:
-        console.print(f"{time.strftime('%H:%M:%S')}  {text}", highlight=False, soft_wrap=True)
+    def tell(text: str) -> None:
+        say(console, f"{time.strftime('%H:%M:%S')}  {text}")
 
     def on_start(run: PlannedRun) -> None:
         at = steps_of(run.folder)
-        say(f"{run.name}: {f'continues at step {at:,}' if at else 'starts'}")
+        tell(f"{run.name}: {f'continues at step {at:,}' if at else 'starts'}")
 
     def on_end(outcome: Outcome) -> None:
         nonlocal ended
@@ -171,7 +171,7 @@ def _run(
         result = outcome.error or _result(by_name[outcome.name])
         took = timedelta(seconds=round(outcome.seconds))
         how = "failed" if outcome.error else "done"
-        say(f"{outcome.name}: {how} after {took} ({ended} of {total}): {result}")
+        tell(f"{outcome.name}: {how} after {took} ({ended} of {total}): {result}")
 
     def tick(now: Sequence[PlannedRun]) -> None:
         nonlocal last
@@ -180,7 +180,7 @@ def _run(
             shares = ((run, steps_of(run.folder) / run.config.steps) for run in now)
             active = [f"{run.name} {share:.0%}" for run, share in shares if share]
             if active:
-                say("  ".join(active))
+                tell("  ".join(active))
 
     if options.ray:
         stopped = run_on_ray(
@@ -215,7 +215,7 @@ def _list(console: Console, runs: Sequence[PlannedRun], settings: Settings, jobs
         table.add_row(run.name, state, cost if isinstance(cost, str) else f"{cost:.2g}")
     console.print(table)
     for run in runs:
-        console.print(f"merl train {shlex.join(run.arguments)}", highlight=False, soft_wrap=True)
+        say(console, f"merl train {shlex.join(run.arguments)}")
     unknown = sum(isinstance(cost, str) for cost in hours.values())
     if unknown:
         console.print(f"the cost of {counted(unknown, 'variant')} is unknown")

@@ -14,9 +14,9 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
-from merl.cli.console import make_console
+from merl.cli.console import make_console, say
 from merl.cli.parsing import parse
-from merl.core import MerlError
+from merl.core.files import reporting
 from merl.envs import make_env
 from merl.envs.registration import ENV_IDS
 from merl.tasks import BOX_TASKS, TASKS
@@ -41,14 +41,14 @@ def tasks(args: list[str]) -> int:
     console = make_console()
     for name in TASKS:
         image = _image(name)
-        console.print(_entry(name, image, console), highlight=False)
+        console.print(_entry(name, image, console))
         for line in _commands(name):
-            console.print(line, highlight=False, soft_wrap=True)
+            say(console, line)
         console.print()
         if folder is not None:
             path = folder / f"{name}.png"
             _write(path, image)
-            console.print(f"image: {path}\n", highlight=False, soft_wrap=True)
+            say(console, f"image: {path}\n")
     return 0
 
 
@@ -112,8 +112,6 @@ def _blocks(image: NDArray[np.uint8]) -> Text:
 
 
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
-    try:
+    with reporting(f"{path} cannot be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(image).save(path)
-    except OSError as error:
-        raise MerlError(f"{path} cannot be written: {error.strerror or error}") from None

@@ -23,14 +23,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 import merl
+from merl.acting.run_env import recipe
 from merl.agents.ddpg import DDPG
 from merl.core import MerlError, check_choice
 from merl.core.files import cause, remove
+from merl.core.user_code import in_one_line
 from merl.evaluation.exported import FORMER, NEXT, Form, Run, Values, card_of, load_exported
 from merl.evaluation.policy import Policy
 from merl.evaluation.to_numpy import numpy_program
 from merl.runs import record
-from merl.runs.plain import describe
+from merl.runs.plain import describe, to_plain
 
 TOLERANCE = 1e-4
 """Largest relative difference between the actions of the policy and of its exported form."""
@@ -103,8 +105,8 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
         The card: inputs and outputs with shapes, types and bounds, the source, the latency.
 
     Raises:
-        MerlError: the policy is that of a user's own agent, a package is missing, or a file cannot
-            be written.
+        MerlError: the policy is that of a user's own agent, it cannot be translated, a package is
+            missing, or a file cannot be written.
     """
     check_choice("form", form, get_args(Form))
     recorded = {} if policy.run is None else record.read(policy.run.path)
@@ -115,9 +117,10 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
     outputs = ["action", *(key + NEXT for key in module.stacked)]
     arguments = tuple(torch.from_numpy(example[name]) for name in names)
     part = output.with_name(f".part-{output.name}")
+    config = policy.config
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        with torch.no_grad(), _quiet():
+        with torch.no_grad(), _quiet(), _translating(form):
             if form == "onnx":
                 _write_onnx(module, arguments, names, outputs, part)
             elif form == "torch":
@@ -125,17 +128,19 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
                     torch.export.save(torch.export.export(module, arguments), file)
             else:
                 program = torch.export.export(module, arguments)
-                title = f"A policy for {policy.config.task}, written by merl {merl.__version__}."
+                title = f"A policy for {config.task}, written by merl {merl.__version__}."
                 text = numpy_program(program, names, outputs, title, output.stem)
                 part.write_text(text)
-        run = load_exported(part, names, outputs)
-        _check_same(module, run, example, arguments)
+            run = load_exported(part, names, outputs)
+            _check_same(module, run, example, arguments)
         part.replace(output)
         card = {
             "format": form,
             "merl": merl.__version__,
-            "task": policy.config.task,
-            "agent": policy.config.agent_name,
+            "task": config.task,
+            "env": None if config.has_user_env else to_plain(recipe(config.evaluated).env),
+            "action_repeat": config.action_repeat,
+            "agent": config.agent_name,
             "step": policy.step,
             "commit": recorded.get("commit"),
             "inputs": {name: _told(example[name]) for name in names},
@@ -151,6 +156,24 @@ def export_policy(policy: Policy, output: Path, form: Form) -> dict[str, Any]:
     finally:
         remove(part)
     return card
+
+
+@contextmanager
+def _translating(form: Form) -> Iterator[None]:
+    """Turn an error of an exporter, or of what it wrote, into one line.
+
+    Raises:
+        MerlError: in place of the error, but for those of the disk.
+    """
+    try:
+        yield
+    except (MerlError, OSError):
+        raise
+    except Exception as error:  # a user's encoder may do what no exporter can translate
+        raise MerlError(
+            f"the policy cannot be written as {form}: {in_one_line(error)}: its encoders must "
+            "consist of operations that torch.export knows, without branches on values"
+        ) from error
 
 
 def _check_same(module: Deployed, run: Run, example: Values, arguments: tuple[Tensor, ...]) -> None:

@@ -13,12 +13,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from merl.acting.instances import EnvRecipe
 from merl.core import MerlError, Observation
 from merl.core.files import read_json
 from merl.core.user_code import in_one_line
+from merl.envs.config import EnvConfig, UserEnvConfig
 from merl.evaluation.policy import checked
 from merl.modalities import modalities_of
-from merl.runs.plain import box
+from merl.runs.plain import box, from_plain
 
 Form = Literal["onnx", "torch", "numpy"]
 SUFFIXES: dict[Form, str] = {"onnx": ".onnx", "torch": ".pt2", "numpy": ".py"}
@@ -43,6 +45,7 @@ class ExportedPolicy:
         card: what the card says.
         modalities: the modality of each key that the policy uses.
         bounds: lower and upper bounds of the actions in the environment's own units.
+        recipe: how the environment of its training was made.
 
     Raises:
         MerlError: the file or its card is missing or damaged, or one is of another policy.
@@ -62,8 +65,13 @@ class ExportedPolicy:
             (size,) = self.card["outputs"]["action"]["shape"]
             if low.shape != (size,) or high.shape != (size,) or not (low < high).all():
                 raise ValueError(f"action_bounds {self.card['action_bounds']}")
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            env = from_plain(EnvConfig, self.card.get("env") or {})
+            repeat = self.card.get("action_repeat", 1)
+            if type(repeat) is not int or repeat < 1:
+                raise ValueError(f"action_repeat {repeat!r}")
+        except (KeyError, TypeError, ValueError, AttributeError, MerlError) as error:
             raise MerlError(f"{card_of(path)} is damaged: {error!r}") from None
+        self.recipe = EnvRecipe(str(self.card.get("task")), env, UserEnvConfig(), repeat)
         self.modalities = modalities_of(space)
         self._former = {name: each for name, each in told.items() if name.endswith(FORMER)}
         self._low, self._high = low, high

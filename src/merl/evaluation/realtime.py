@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 import gymnasium
 import numpy as np
@@ -76,34 +76,15 @@ class Driven:
     end: End
 
 
-class Recording(Protocol):
-    """Recording of an episode's steps, such as `merl.demos.episode.EpisodeRecording`."""
-
-    def __len__(self) -> int:
-        """Return the number of steps."""
-        ...
-
-    def add(
-        self,
-        action: NDArray[np.float32],
-        intended: NDArray[np.float32],
-        observation: Observation,
-        reward: float,
-        info: Mapping[str, Any],
-    ) -> None:
-        """Add a step."""
-        ...
-
-
 def drive(
     act: Act,
     env: gymnasium.Env[Any, Any],
     observation: Observation,
-    recording: Recording,
     rate: float,
     limits: Limits,
     stop: Callable[[], bool],
     *,
+    record: Callable[..., None] = lambda *step: None,
     sleep: Callable[[float], None] = time.sleep,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Driven:
@@ -116,10 +97,10 @@ def drive(
         act: maps an observation to an action in [-1, 1].
         env: the environment, whose step may return before the robot has moved.
         observation: the observation after the reset.
-        recording: gets every step, `intended` before the limits; it keeps them after an error.
         rate: steps per second.
         limits: limits of actions, steps and lateness.
         stop: whether to stop, asked before every action.
+        record: gets every step, as `merl.demos.episode.EpisodeRecording.add`.
         sleep: waits, s.
         clock: returns the time, s.
 
@@ -142,8 +123,8 @@ def drive(
         thought = clock()
         last = limits.apply(action, last)
         observation, reward, terminated, truncated, info = env.step(last)
-        check_finite(observation, float(reward), len(recording) + 1)
-        recording.add(last, action, observation, float(reward), info)
+        check_finite(observation, float(reward), len(timing.env) + 1)
+        record(last, action, observation, float(reward), info)
         ended = clock()
         timing.policy.append(thought - started)
         timing.env.append(ended - thought)
@@ -153,7 +134,7 @@ def drive(
         begin = ended if late else begin + period
         if terminated or truncated:
             end = "terminated" if terminated else "truncated"
-        elif limits.steps is not None and len(recording) >= limits.steps:
+        elif limits.steps is not None and len(timing.env) >= limits.steps:
             end = "time"
         elif behind >= limits.late:
             end = "late"

@@ -59,15 +59,9 @@ class Disturbance:
     form: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Disturbed:
-    """The evaluation of a policy with one disturbance."""
-
-    disturbance: Disturbance
-    evaluation: Evaluation
-
-
-def robustness(policy: Policy, episodes: int, *, trust: bool = False) -> Iterator[Disturbed]:
+def robustness(
+    policy: Policy, episodes: int, *, trust: bool = False
+) -> Iterator[tuple[Disturbance, Evaluation]]:
     """Evaluate a policy undisturbed, then with each disturbance that its senses can have.
 
     Args:
@@ -82,13 +76,10 @@ def robustness(policy: Policy, episodes: int, *, trust: bool = False) -> Iterato
         key: [] for key, modality in policy.modalities.items() if modality.kind in NUMBERS
     }
     undisturbed = Disturbance("none", "undisturbed", partial(Recorder, seen=seen))
-    yield Disturbed(
-        undisturbed, policy.evaluate(episodes=episodes, trust=trust, wrap=undisturbed.wrap)
-    )
+    yield undisturbed, policy.evaluate(episodes=episodes, trust=trust, wrap=undisturbed.wrap)
     scales = {key: np.std(values, axis=0) for key, values in seen.items()}
     for each in disturbances(policy, scales):
-        result = policy.evaluate(episodes=episodes, trust=trust, wrap=each.wrap, **each.form)
-        yield Disturbed(each, result)
+        yield each, policy.evaluate(episodes=episodes, trust=trust, wrap=each.wrap, **each.form)
 
 
 def disturbances(policy: Policy, scales: Mapping[str, Value]) -> Iterator[Disturbance]:

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from merl.core import MerlError
+from merl.core.files import replace_file, reporting
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode
 from merl.envs.learnt_success import SHAPES
@@ -187,6 +188,12 @@ def _report(network: SuccessNetwork, data: Labelled, threshold: float) -> Report
 
 
 def save_classifier(network: SuccessNetwork, data: Labelled, file: Path) -> None:
-    """Write a classifier, for `merl.envs.learnt_success.LearntSuccess`."""
+    """Write a classifier, for `merl.envs.learnt_success.LearntSuccess`.
+
+    Raises:
+        MerlError: the file cannot be written; an existing one keeps its content.
+    """
     shapes = {key: values.shape[1:] for key, values in data.images.items()}
-    save_file(network.state_dict(), file, {SHAPES: json.dumps(shapes)})
+    content = save(network.state_dict(), {SHAPES: json.dumps(shapes)})
+    with reporting(f"{file} cannot be written"):
+        replace_file(file, content)

@@ -188,7 +188,10 @@ def record_by_hand(
             window.show(shown, [f"{note}   step {len(recording)}"])
             return action_for(window.read())
 
-        driven = drive(act, env, observation, recording, rate, Limits(late=10**9), window.ended)
+        limits = Limits(late=10**9)
+        driven = drive(
+            act, env, observation, rate, limits, window.ended, record=recording.add
+        )
         if window.discards or not len(recording):
             continue
         episode = recording.finish(terminated=driven.end == "terminated")

@@ -132,7 +132,7 @@ def _cast(x: str, *, dtype: Any = None, **_: Any) -> str:
 def _convolution(
     x: str,
     weight: str,
-    bias: str,
+    bias: str | None,
     stride: Any,
     padding: Any,
     dilation: Any,
@@ -142,7 +142,7 @@ def _convolution(
 ) -> str:
     if transposed or groups != 1 or set(dilation) != {1}:
         raise NotImplementedError
-    return f"convolve({x}, {weight}, {bias}, {stride}, {padding})"
+    return f"convolve({x}, {weight}, {bias or 0}, {stride}, {padding})"
 
 
 def _limits(x: str, low: Any = None, high: Any = None) -> str:
@@ -182,7 +182,9 @@ FORMS: dict[str, Callable[..., str]] = {
     "slice.Tensor": _cut,
     "sum.dim_IntList": _sum,
     "convolution.default": _convolution,
-    "native_layer_norm.default": lambda x, _, w, b, eps: f"(layer_norm({x}, {w}, {b}, {eps}),)",
+    "native_layer_norm.default": lambda x, _, w, b, eps: (
+        f"(layer_norm({x}, {w or 1}, {b or 0}, {eps}),)"
+    ),
     "relu.default": lambda x: f"np.maximum({x}, 0)",
     "tanh.default": lambda x: f"np.tanh({x})",
     "sqrt.default": lambda x: f"np.sqrt({x})",

@@ -1,1 +1,1 @@
-"""Experiments: presets, and small tasks with a known optimum."""
+"""Experiments: presets, and the runs of sweeps."""

@@ -66,11 +66,17 @@ def clone_first(
 
 
 def starts_cloned(config: TrainConfig, run: Run) -> TrainConfig:
-    """Return the config with which a run that `clone_first` prepared is resumed."""
+    """Return the config with which a run that `clone_first` prepared is resumed.
+
+    A run that did not start with RUN-bc differs from it in `agent.start_from`.
+    """
     if not config.demos_pretrain:
         return config
     names = ("start_from", "frozen_encoders") if _freezes(config) else ("start_from",)
     begun = {name: getattr(run.config.agent, name, None) for name in names}
+    cloned = run.path.with_name(f"{run.path.name}-bc")
+    if getattr(begun["start_from"], "name", None) != cloned.name:  # the folders may have moved
+        begun["start_from"] = cloned
     return replace(config, demos_pretrain=0, agent=override(config.agent, begun))
 
 

@@ -75,7 +75,7 @@ def run_on_ray(
                 done, _ = ray.wait([*waiting], timeout=1.0)
                 for reference in done:
                     run = waiting.pop(reference)
-                    ended(Outcome(run.name, _error(ray, reference), time.monotonic() - begin))
+                    ended(_outcome(ray, reference, run.name, begin))
                 tick([*waiting.values()])
             for reference in waiting:
                 ray.cancel(reference, force=False)
@@ -86,13 +86,13 @@ def run_on_ray(
         ray.shutdown()
 
 
-def _error(ray: Any, reference: Any) -> str | None:
-    """Return why a task failed; None if it did not."""
+def _outcome(ray: Any, reference: Any, name: str, begin: float) -> Outcome:
+    """Return how a task ended; only its worker knows how long it took."""
     try:
-        error: str | None = ray.get(reference)
-        return error
+        outcome: Outcome = ray.get(reference)
+        return outcome
     except Exception as failed:  # the worker or its machine was lost too often
-        return f"lost by Ray: {_line(failed)}"
+        return Outcome(name, f"lost by Ray: {_line(failed)}", time.monotonic() - begin)
 
 
 def _line(error: Exception) -> str:

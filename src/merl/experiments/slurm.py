@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from merl.core import MerlError
+from merl.core.files import reporting
 from merl.experiments.experiment import PlannedRun
 from merl.experiments.sweep import Settings, commands
 from merl.runs.run_folder import program
@@ -55,7 +55,5 @@ def write_array(
         both = (f"merl {shlex.join(command)}" for command in commands(run, settings))
         lines.append(f"  {number}) {' && '.join(both)} ;;")
     lines.append("esac")
-    try:
+    with reporting(f"{path} cannot be written"):
         path.write_text("\n".join(lines) + "\n")
-    except OSError as error:
-        raise MerlError(f"{path} cannot be written: {error.strerror}") from None

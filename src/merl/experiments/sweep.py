@@ -27,9 +27,10 @@ from merl.core import (
     METRICS_FILE,
     MerlError,
 )
-from merl.core.files import read_json
+from merl.core.files import read_json, reporting
 from merl.core.signals import Interrupt
 from merl.core.watching import end_with_parent
+from merl.experiments.cloning_first import starts_cloned
 from merl.experiments.experiment import PlannedRun
 from merl.runs.resume import left_open
 from merl.runs.run import Run
@@ -63,7 +64,7 @@ class Outcome:
 
     Attributes:
         name: the run's name.
-        error: why it failed, in one line; None if it is done.
+        error: why it failed, in one line; None if it is done, or stopped.
         seconds: how long it took, this time.
     """
 
@@ -84,10 +85,11 @@ def is_done(run: PlannedRun, episodes: int) -> bool:
     """
     if not (run.folder / CONFIG_FILE).exists():
         return False
-    recorded, wanted = flat(Run.open(run.folder).config), flat(run.config)
+    found = Run.open(run.folder)
+    recorded, wanted = flat(found.config), flat(starts_cloned(run.config, found))
     open_fields = left_open(run.config)
     for name, value in wanted.items():
-        same = recorded.get(name) == value or name in (*HARMLESS, *open_fields, "run_dir")
+        same = _equal(recorded.get(name), value) or name in (*HARMLESS, *open_fields, "run_dir")
         if not same and name in recorded:
             raise MerlError(
                 f"{run.folder} holds a run of another experiment ({name} {recorded[name]}, not "
@@ -97,6 +99,11 @@ def is_done(run: PlannedRun, episodes: int) -> bool:
     if evaluated is None or len(evaluated["episodes"]) < episodes:
         return False
     return run.config.minutes is not None or evaluated["step"] >= run.config.steps
+
+
+def _equal(recorded: Any, wanted: Any) -> bool:
+    """Return whether two values are equal; a sweep's file has paths as text."""
+    return bool(recorded == (Path(wanted) if isinstance(recorded, Path) and wanted else wanted))
 
 
 def evaluation_of(folder: Path) -> dict[str, Any] | None:
@@ -137,7 +144,7 @@ def execute(
     settings: Settings,
     stopped: Callable[[], bool] = lambda: False,
     folder: Path | None = None,
-) -> str | None:
+) -> Outcome:
     """Train or resume a run to its end and evaluate it; its output goes to NAME.log.
 
     Args:
@@ -145,10 +152,19 @@ def execute(
         settings: how it is run.
         stopped: whether to stop; then the run saves and ends.
         folder: the working folder; None for this process's.
-
-    Returns:
-        Why it failed, in one line; None if it is done, or stopped.
     """
+    begin = time.monotonic()
+    try:
+        error = _executed(run, settings, stopped, folder)
+    except OSError as failed:  # the log or the process cannot be made
+        error = f"it cannot be started: {failed}"
+    return Outcome(run.name, error, time.monotonic() - begin)
+
+
+def _executed(
+    run: PlannedRun, settings: Settings, stopped: Callable[[], bool], folder: Path | None
+) -> str | None:
+    """Return why a run failed, in one line; None if it is done, or stopped; see `execute`."""
     run.folder.parent.mkdir(parents=True, exist_ok=True)
     log = run.folder.with_name(f"{run.name}.log")
     for command in commands(run, settings):
@@ -250,15 +266,11 @@ def run_here(
                 run = waiting.pop(0)
                 active[run.name] = run
             started(run)
-            begin = time.monotonic()
-            try:
-                error = execute(run, settings, stop.is_set)
-            except OSError as failed:  # the log or the process cannot be made
-                error = f"it cannot be started: {failed}"
+            outcome = execute(run, settings, stop.is_set)
             with lock:
                 del active[run.name]
                 if not stop.is_set():
-                    ended(Outcome(run.name, error, time.monotonic() - begin))
+                    ended(outcome)
 
     threads = [threading.Thread(target=work) for _ in range(min(jobs, len(runs)))]
     with Interrupt().listening() as interrupt:
@@ -281,7 +293,5 @@ def check_folder(folder: Path) -> None:
     Raises:
         MerlError: it cannot be made.
     """
-    try:
+    with reporting(f"--out {folder} cannot be created"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MerlError(f"--out {folder} cannot be created: {error.strerror}") from None

@@ -109,19 +109,6 @@ class Spooled(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._connection.notify()
 
 
-class _Count:
-    """A recording of an episode that only counts its steps."""
-
-    def __init__(self) -> None:
-        self._steps = 0
-
-    def __len__(self) -> int:
-        return self._steps
-
-    def add(self, *step: Any) -> None:
-        self._steps += 1
-
-
 class Actor:
     """Acts with exploration noise, in episodes that go to the learner.
 
@@ -185,9 +172,7 @@ class Actor:
             with self._stop.at_once():  # it may wait for a person
                 observation, _ = self._env.reset(seed=seed)
             seed = None
-            driven = drive(
-                self._act, self._env, observation, _Count(), rate, self._limits, self._ends
-            )
+            driven = drive(self._act, self._env, observation, rate, self._limits, self._ends)
             yield self._env.episode, driven
             if driven.end in ("stopped", "late"):
                 return

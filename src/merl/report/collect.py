@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,13 @@ from merl.core.files import open_file, read_json
 from merl.envs.config import EnvConfig
 from merl.envs.registration import ENV_IDS
 from merl.report.curves import Array, Curve, curve_of, read_metrics
-from merl.report.references import form, references
+from merl.report.references import EPISODE, form, references
 
 SUCCESS, RETURN = "success_end", "return"
 UNKNOWN_TASK = "unknown task"
 _SEED = re.compile(r"-s(\d+)(-\d+)?$")
+_SEED_OF_START = re.compile(r"-s\d+(-\d+)?(?=-bc$|$)")
+"""The seed in the name of the run that a run started with, e.g. its own RUN-bc."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,11 @@ class SeedRun:
     @property
     def learnt(self) -> dict[str, Any]:
         """The values that decide what is learnt, without the seed."""
-        return {k: v for k, v in self.values.items() if k not in (*HARMLESS, "seed")}
+        found = {k: v for k, v in self.values.items() if k not in (*HARMLESS, "seed")}
+        start = found.get("agent.start_from")
+        if isinstance(start, str):
+            found["agent.start_from"] = _SEED_OF_START.sub("", start)
+        return found
 
     @property
     def env(self) -> EnvConfig:
@@ -107,7 +113,15 @@ class SeedRun:
     @property
     def references(self) -> dict[str, float]:
         """The known returns of the task in this form, by name."""
-        return {one.name: one.returns.mean for one in references(self.task, self.env)}
+        limit = self.values.get("eval.max_episode_steps", EPISODE)
+        return {one.name: one.returns.mean for one in references(self.task, self.env, limit)}
+
+    @property
+    def last_step(self) -> int:
+        """The environment steps of the last row of the metrics that has them; 0 without one."""
+        steps = self.metrics["step"]
+        known = steps[~np.isnan(steps)]
+        return int(known[-1]) if len(known) else 0
 
     @property
     def videos(self) -> dict[int, Path]:
@@ -180,7 +194,7 @@ def collect(paths: Iterable[Path]) -> tuple[list[Group], list[str]]:
             notes.append(f"skipped: {path} has no evaluation yet")
             continue
         if run.active:
-            notes.append(f"{run.name} is still training: at step {int(run.metrics['step'][-1]):,}")
+            notes.append(f"{run.name} is still training: at step {run.last_step:,}")
         runs.append(run)
     if not runs:
         raise MerlError("no run can be read: " + ("; ".join(notes) or "no path was given"))
@@ -203,12 +217,10 @@ def read_run(path: Path) -> SeedRun:
         raise MerlError(f"{path} contains infinite numbers")
     record, evaluation = _json(path / CONFIG_FILE), _json(path / EVALUATION_FILE)
     episodes, step = evaluation.get("episodes"), evaluation.get("step")
-    last = float(metrics["step"][-1]) if len(metrics["step"]) else 0.0
-    is_newest = isinstance(step, int) and step >= last  # the run was not trained further
     rows = [row for row in episodes if _is_row(row)] if isinstance(episodes, list) else []
-    run = SeedRun(
-        path, record, metrics, tuple(rows) if is_newest else (), _locked(path / LOCK_FILE)
-    )
+    run = SeedRun(path, record, metrics, tuple(rows), _locked(path / LOCK_FILE))
+    if not isinstance(step, int) or step < run.last_step:  # the run was trained further
+        run = replace(run, episodes=())
     try:
         _ = run.form, run.references  # a record may come from anyone
     except (MerlError, TypeError, ValueError, AttributeError) as error:
@@ -265,13 +277,19 @@ def _grouped(runs: Sequence[SeedRun]) -> list[Group]:
 
 
 def _distinction(run: SeedRun, twins: Sequence[SeedRun]) -> str:
-    """Return the values in which a run differs from others of its label."""
+    """Return values in which a run differs from all others of its label: three, or more."""
     names = [
         name
         for name, value in run.learnt.items()
         if any(other.learnt.get(name) != value for other in twins)
     ]
-    return ", ".join(f"{name} {run.values[name]}" for name in names[:3]) or run.name
+
+    def told(each: SeedRun, count: int) -> str:
+        return ", ".join(f"{name} {each.learnt.get(name)}" for name in names[:count])
+
+    counts = range(3, len(names))
+    few = (n for n in counts if sum(told(each, n) == told(run, n) for each in twins) == 1)
+    return told(run, next(few, len(names))) or run.name
 
 
 def _about_seeds(groups: Sequence[Group]) -> Iterator[str]:
@@ -288,7 +306,7 @@ def _about_seeds(groups: Sequence[Group]) -> Iterator[str]:
             if twice:
                 named = ", ".join(map(str, sorted(twice, key=str)))
                 yield f"{task}: {group.label} has seed {named} more than once: each run counts"
-            ends = {int(run.metrics["step"][-1]) for run in group.runs}
+            ends = {run.last_step for run in group.runs}
             if len(ends) > 1:
                 yield (
                     f"{task}: the seeds of {group.label} are of unequal length: their mean ends at "

@@ -25,7 +25,6 @@ from merl.report.drawing import (
     DASHES,
     FAINT,
     GREEN,
-    INK,
     LABEL_SIZE,
     MUTED,
     PALETTE,
@@ -148,45 +147,6 @@ def learning_curves(
         note = f"bold: mean over the seeds; band: {around}; thin: each seed"
         axes.set_title(note, loc="left", color=MUTED, size=LABEL_SIZE)
     direct_labels(figure, {axes: labels})
-    return save(figure, Path(output))
-
-
-def reward_terms(runs: Mapping[str, Run], output: Path | str) -> Path:
-    """Draw the terms of the reward over training: a panel for each run, a curve for each term.
-
-    A curve shows the sum of a term over an evaluation episode, `eval/reward/TERM`.
-
-    Args:
-        runs: {label: run folder, or CSV file with the layout of `metrics.csv`}.
-        output: the figure's file.
-
-    Returns:
-        `output`.
-
-    Raises:
-        MerlError: a file is missing or malformed, a run has no terms, or `output` cannot be
-            written.
-    """
-    figure = new_figure(height=2.9 * len(runs))
-    panels = np.atleast_1d(figure.subplots(len(runs), 1))
-    labels: dict[Axes, list[Label]] = {}
-    for axes, (label, run) in zip(panels, runs.items(), strict=True):
-        metrics = read_metrics(run)
-        names = [name for name in metrics if name.startswith("eval/reward/")]
-        if not names:
-            raise MerlError(f"{label}: {run} has no terms of a reward (columns eval/reward/...)")
-        style(axes, "sum over an episode")
-        axes.set_title(label, loc="left", color=INK, size=LABEL_SIZE + 1, weight="bold")
-        labels[axes] = []
-        for name, color in zip(names, PALETTE, strict=False):
-            drawn = curve_of(metrics, name)
-            axes.plot(*drawn, color=color, lw=1.8)
-            last = drawn.values[-1]
-            text = f"{name.removeprefix('eval/reward/')} {number(last)}"
-            labels[axes].append(Label(text, last, color, "bold"))
-        value_axis(axes, [], False)
-        step_axis(axes, metrics["step"])
-    direct_labels(figure, labels)
     return save(figure, Path(output))
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from string import Template
 
 from merl.core import MerlError, counted
+from merl.core.files import replace_file, reporting
 from merl.report.collect import RETURN, SUCCESS, Group, SeedRun
 from merl.report.curves import Curve
 from merl.report.figures import learning_curves
@@ -72,10 +73,8 @@ def write_report(
         MerlError: a file cannot be written.
     """
     rows = [row_of(group) for group in groups]
-    try:
+    with reporting(f"{out} cannot be created"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MerlError(f"{out} cannot be created: {error.strerror}") from None
     write_table(rows, out / "table.csv")
     budget = _Budget(MOST_VIDEO)
     tasks = [*dict.fromkeys(group.task for group in groups)]
@@ -105,12 +104,8 @@ def write_report(
         sections="\n".join(sections),
     )
     path = out / "index.html"
-    part = out / ".index.html.part"
-    try:
-        part.write_text(page)
-        part.replace(path)
-    except OSError as error:
-        raise MerlError(f"{path} cannot be written: {error.strerror}") from None
+    with reporting(f"{path} cannot be written"):
+        replace_file(path, page.encode())
     return path
 
 
@@ -201,17 +196,17 @@ def _curves(groups: Sequence[Group], task: str, name: str, x: str, out: Path) ->
         return None
     known = groups[0].runs[0].references if name == RETURN else {}
     shown = {word: known[word] for word in (RANDOM, EXPERT) if word in known}
-    stem = out / f"{slug(task)}-{name}-{x}"
+    stem = f"{slug(task)}-{name}-{x}"
     for suffix in (".png", ".svg"):
         learning_curves(
             found,
-            stem.with_suffix(suffix),
+            out / f"{stem}{suffix}",  # a task's name may have dots
             x="minutes" if x == "minutes" else "steps",
             name=f"eval/{name}",
             band="bootstrap",
             references=shown,
         )
-    return stem.with_suffix(".svg")
+    return out / f"{stem}.svg"
 
 
 def _overall_section(summaries: Sequence[Overall], tasks: Sequence[str], out: Path) -> str:

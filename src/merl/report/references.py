@@ -7,7 +7,7 @@ numbers are quoted with their source.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -19,6 +19,8 @@ RANDOM = "random actions"
 """Name of the reference with random actions."""
 EXPERT = "scripted expert"
 """Name of the reference that solves the task with the simulator's state."""
+EPISODE = 250
+"""Environment steps of an episode over which all returns are measured."""
 
 
 @dataclass(frozen=True)
@@ -31,30 +33,33 @@ class Reference:
             mean.
         success_end: rate of success at the end of the episode, in the same form; None if unknown.
         source: origin of the numbers.
-        terms: {term of the reward: its mean sum over an episode}; empty if unknown.
     """
 
     name: str
     returns: Interval
     success_end: Interval | None
     source: str
-    terms: dict[str, float] = field(default_factory=dict)
 
 
-def references(task: str, env: EnvConfig | None = None) -> tuple[Reference, ...]:
+def references(
+    task: str, env: EnvConfig | None = None, limit: int = EPISODE
+) -> tuple[Reference, ...]:
     """Return the references of a task, from the lowest to the highest; empty if not measured.
 
     Args:
         task: the task's name.
         env: the form of the task; `benchmarks/measure_references.py` lists the measured forms.
+        limit: environment steps after which an evaluation cuts an episode off: shorter episodes
+            have no references.
     """
+    if limit < EPISODE:
+        return ()
     return tuple(
         Reference(
             row["name"],
             Interval(*row["return"]),
             None if row["success_end"] is None else Interval(*row["success_end"]),
             row["source"],
-            row.get("terms", {}),
         )
         for row in _measured().get(form(task, env or EnvConfig()), [])
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from matplotlib.ticker import PercentFormatter
 
-from merl.core import MerlError
+from merl.core.files import reporting
 from merl.core.statistics import Interval
 from merl.report.drawing import (
     BLUE,
@@ -70,13 +70,10 @@ def write_rows(rows: Sequence[Row], path: Path) -> None:
     Raises:
         MerlError: the file cannot be written.
     """
-    try:
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, [field.name for field in fields(Row)])
-            writer.writeheader()
-            writer.writerows(asdict(row) for row in rows)
-    except OSError as error:
-        raise MerlError(f"{path} cannot be written: {error.strerror}") from None
+    with reporting(f"{path} cannot be written"), path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Row)])
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
 
 
 def draw_rows(rows: Sequence[Row], title: str, output: Path) -> Path:

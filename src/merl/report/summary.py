@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from merl.core import MerlError
+from merl.core.files import reporting
 from merl.core.statistics import Interval, bootstrap_interval
 from merl.report.aggregates import (
     Array,
@@ -91,7 +91,7 @@ def row_of(group: Group) -> Row:
     """Compute the results of a group."""
     runs, seeds = group.runs, len(group.runs)
     curves = [run.curve(RETURN) for run in runs]
-    end = min(float(run.metrics["step"][-1]) for run in runs)
+    end = min(float(run.last_step) for run in runs)
     results = {"final return": Estimate.of(group.final(RETURN), seeds)}
     if all(len(curve.steps) for curve in curves):
         end = min(float(curve.steps[-1]) for curve in curves)
@@ -266,18 +266,15 @@ def write_table(rows: Sequence[Row], path: Path) -> None:
     """
     names = [*dict.fromkeys(name for row in rows for name in row.results)]
     ends = [f"{name}{end}" for name in names for end in ("", " low", " high", " seeds")]
-    try:
-        with path.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(["task", "variant", "seeds", "steps", "minutes", "spread", *ends])
-            for row in rows:
-                cells: list[object] = [row.group.task, row.group.label]
-                cells += [len(row.group.runs), row.steps, row.minutes.mean, row.spread]
-                for name in names:
-                    one = row.results.get(name)
-                    cells += (
-                        ["", "", "", 0] if one is None else [one.mean, one.low, one.high, one.count]
-                    )
-                writer.writerow("" if cell != cell else cell for cell in cells)  # NaN
-    except OSError as error:
-        raise MerlError(f"{path} cannot be written: {error.strerror}") from None
+    with reporting(f"{path} cannot be written"), path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["task", "variant", "seeds", "steps", "minutes", "spread", *ends])
+        for row in rows:
+            cells: list[object] = [row.group.task, row.group.label]
+            cells += [len(row.group.runs), row.steps, row.minutes.mean, row.spread]
+            for name in names:
+                one = row.results.get(name)
+                cells += (
+                    ["", "", "", 0] if one is None else [one.mean, one.low, one.high, one.count]
+                )
+            writer.writerow("" if cell != cell else cell for cell in cells)  # NaN

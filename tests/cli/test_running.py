@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from merl.cli.duration import duration
+from merl.cli.running import duration
 from merl.config import TrainConfig
 from merl.core import counted
 from merl.replay import ReplayConfig

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.acting.environments import Step
@@ -42,19 +43,22 @@ class Corrections:
         correct: maps the agent's actions (N, A) to those that are executed.
         demos: the replay of the demonstrations; the replay of the corrections is of its kind.
         recorder: writes the corrections; those that its folder holds are read.
+        space: the run's observations, in whose bounds depth is stored.
 
     Attributes:
         replay: the corrections, to draw from.
     """
 
-    def __init__(self, correct: Correct, demos: ReplayBuffer, recorder: Recorder) -> None:
+    def __init__(
+        self, correct: Correct, demos: ReplayBuffer, recorder: Recorder, space: spaces.Dict
+    ) -> None:
         self.replay = ReplayBuffer(replace(demos.spec, capacity=CAPACITY))
-        self._correct, self._recorder = correct, recorder
+        self._correct, self._recorder, self._space = correct, recorder, space
         self._observations: dict[int, Observation] = {}  # the newest, by environment
         self._open: dict[int, EpisodeRecording] = {}  # stretches in progress, by environment
         self._actions: dict[int, NDArray[np.float32]] = {}  # of this step, where corrected
         for episode in recorder.demonstrations.episodes():
-            self._store(episode)
+            store(episode, self.replay, space)
 
     @classmethod
     @contextmanager
@@ -76,10 +80,9 @@ class Corrections:
             )
         config = setup.config
         options = {} if config.has_user_env else config.env.form
-        spaces = setup.space, setup.action_space
-        folder = run.path / FOLDER
-        recorder = Recorder(folder, config.task, "corrections", *spaces, options, append=True)
-        corrections = cls(correct.correct, setup.demos, recorder)
+        own, folder = (setup.space, setup.action_space), run.path / FOLDER
+        recorder = Recorder(folder, config.task, "corrections", *own, options, append=True)
+        corrections = cls(correct.correct, setup.demos, recorder, setup.space)
         try:
             yield corrections
         finally:
@@ -121,8 +124,4 @@ class Corrections:
         if recording is not None and len(recording):
             episode = recording.finish(terminated=terminated)
             self._recorder.add(episode)
-            self._store(episode)
-
-    def _store(self, episode: Episode) -> None:
-        keys = self._recorder.demonstrations.observation_space
-        store(episode, self.replay, keys)
+            store(episode, self.replay, self._space)

@@ -218,3 +218,17 @@ def test_depth_of_corrections_is_that_of_the_runs_own_experience(tmp_path: Path)
         assert len(person.corrected) == 2 * observations
         for at, frame in person.corrected.items():
             np.testing.assert_array_equal(frame, person.own[at])
+
+
+@pytest.mark.parametrize(("capacity", "expected"), [(100, 40), (12, 12)])
+def test_corrections_take_no_more_memory_than_the_run_can_fill(
+    capacity: int, expected: int, demos: Path
+) -> None:
+    class Measuring(Person):
+        def on_start(self, trainer: Trainer) -> None:
+            super().on_start(trainer)
+            assert trainer._corrections is not None
+            assert trainer._corrections.replay.spec.capacity == expected
+
+    run = train(demos, Measuring(*range(40)), **{"replay.capacity": capacity})
+    assert Demonstrations.open(run / "corrections").steps == 40

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 FOLDER = "corrections"
 """Folder of the corrections in a run's folder."""
 CAPACITY = 100_000
-"""Steps of corrections that are drawn; older ones stay in the folder alone."""
+"""Most steps of corrections that are drawn; older ones stay in the folder alone."""
 
 Correct = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -41,7 +41,7 @@ class Corrections:
 
     Args:
         correct: maps the agent's actions (N, A) to those that are executed.
-        demos: the replay of the demonstrations; the replay of the corrections is of its kind.
+        replay: an empty replay like that of the demonstrations.
         recorder: writes the corrections; those that its folder holds are read.
         space: the run's observations, in whose bounds depth is stored.
 
@@ -50,15 +50,15 @@ class Corrections:
     """
 
     def __init__(
-        self, correct: Correct, demos: ReplayBuffer, recorder: Recorder, space: spaces.Dict
+        self, correct: Correct, replay: ReplayBuffer, recorder: Recorder, space: spaces.Dict
     ) -> None:
-        self.replay = ReplayBuffer(replace(demos.spec, capacity=CAPACITY))
-        self._correct, self._recorder, self._space = correct, recorder, space
+        self.replay, self._space = replay, space
+        self._correct, self._recorder = correct, recorder
         self._observations: dict[int, Observation] = {}  # the newest, by environment
         self._open: dict[int, EpisodeRecording] = {}  # stretches in progress, by environment
         self._actions: dict[int, NDArray[np.float32]] = {}  # of this step, where corrected
         for episode in recorder.demonstrations.episodes():
-            store(episode, self.replay, space)
+            store(episode, replay, space)
 
     @classmethod
     @contextmanager
@@ -82,7 +82,8 @@ class Corrections:
         options = {} if config.has_user_env else config.env.form
         own, folder = (setup.space, setup.action_space), run.path / FOLDER
         recorder = Recorder(folder, config.task, "corrections", *own, options, append=True)
-        corrections = cls(correct.correct, setup.demos, recorder, setup.space)
+        spec = replace(setup.demos.spec, capacity=min(CAPACITY, config.capacity))
+        corrections = cls(correct.correct, ReplayBuffer(spec), recorder, setup.space)
         try:
             yield corrections
         finally:

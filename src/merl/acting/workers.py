@@ -69,11 +69,15 @@ class WorkerEnvs:
         self.count, self.action_shape = count, here.action_space.shape or ()
         self._recipe, self._here, self._timeout = recipe, here, timeout
         self._lost: str | None = None  # why a process is lost
+        self._level = gymnasium.logger.min_level  # of the caller
         try:
             self._env = self._started()
-        except WorkerDied as lost:
+        except BaseException as error:
+            gymnasium.logger.min_level = self._level
+            if not isinstance(error, WorkerDied):
+                raise
             raise EnvironmentsLost(
-                f"an environment's process {lost} while it started: see its output above"
+                f"an environment's process {error} while it started: see its output above"
             ) from None
 
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
@@ -122,6 +126,7 @@ class WorkerEnvs:
     def close(self) -> None:
         """See `Environments`."""
         _end(self._env)
+        gymnasium.logger.min_level = self._level
 
     @contextmanager
     def _loss(self) -> Iterator[None]:

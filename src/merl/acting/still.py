@@ -66,7 +66,7 @@ class StillEnv(gymnasium.Env[Any, Any]):
     Args:
         space: the observation space, in the form that agents use.
         action_space: the action space, in [-1, 1].
-        bounds: see `merl.acting.run_env.own_bounds`.
+        bounds: see `merl.acting.instances.own_bounds`.
     """
 
     def __init__(

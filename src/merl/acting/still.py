@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from merl.acting.environments import Step
+from merl.acting.environments import Environments, Step
 from merl.core import Observation
 
 EPISODE = 250
 """Steps of an episode: how often a run logs, and may evaluate and save."""
 
 
-class StillEnvs:
-    """Environments whose observations and rewards are all 0; see `Environments`.
+class StillEnvs(Environments):
+    """Environments whose observations and rewards are all 0.
 
     Args:
         space: the observation space.
@@ -38,9 +37,6 @@ class StillEnvs:
         self._steps = 0  # all episodes begin and end together
         return dict.fromkeys(seeds, self._zeros)
 
-    def send(self, actions: NDArray[np.float32]) -> None:
-        """Do nothing."""
-
     def receive(self) -> list[Step]:
         """See `Environments`."""
         self._steps += 1
@@ -49,15 +45,6 @@ class StillEnvs:
     def states(self) -> list[dict[str, Any]]:
         """See `Environments`; there are no random numbers to restore."""
         return [{"bit_generator": None}] * self.count
-
-    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
-        """Do nothing."""
-
-    def restart(self) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
 
 
 class StillEnv(gymnasium.Env[Any, Any]):

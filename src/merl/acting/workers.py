@@ -20,7 +20,7 @@ from gymnasium.vector.async_vector_env import AsyncState
 from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 
-from merl.acting.environments import Step, WorkerDied
+from merl.acting.environments import Environments, Step, WorkerDied
 from merl.acting.generators import (
     environment_state,
     seed_global_generators,
@@ -45,7 +45,7 @@ END_SECONDS = 5.0
 """Time limit within which the processes must have ended; after that they are killed."""
 
 
-class WorkerEnvs:
+class WorkerEnvs(Environments):
     """Environments in worker processes that step in parallel.
 
     The processes are spawned (a fork with OpenGL or threads hangs), return observations through

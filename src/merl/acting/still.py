@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium import spaces
 
 from merl.acting.environments import Environments, Step
-from merl.core import Observation
+from merl.acting.instances import EnvSpaces
+from merl.core import MerlError, Observation
 
 EPISODE = 250
 """Steps of an episode: how often a run logs, and may evaluate and save."""
@@ -48,19 +49,18 @@ class StillEnvs(Environments):
 
 
 class StillEnv(gymnasium.Env[Any, Any]):
-    """An environment that only has spaces, those of an environment on another machine.
+    """An environment that only has spaces: those of one on another machine, or that cannot be used.
 
     Args:
-        space: the observation space, in the form that agents use.
-        action_space: the action space, in [-1, 1].
-        bounds: see `merl.acting.instances.own_bounds`.
+        known: the spaces.
+        error: raised by `reset`.
     """
 
-    def __init__(
-        self,
-        space: spaces.Dict,
-        action_space: spaces.Box,
-        bounds: tuple[list[float], list[float]] | None,
-    ) -> None:
-        self.observation_space, self.action_space = space, action_space
-        self.own_bounds = bounds
+    def __init__(self, known: EnvSpaces, error: MerlError | None = None) -> None:
+        self.observation_space, self.action_space = known.observation, known.action
+        self.own_bounds = known.bounds
+        self._error = error or MerlError("this environment only has spaces")
+
+    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+        """Raise the error."""
+        raise self._error

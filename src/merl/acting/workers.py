@@ -28,6 +28,7 @@ from merl.acting.generators import (
 )
 from merl.acting.instances import EnvRecipe, EnvSpaces, with_keys
 from merl.acting.processes import Processes, belong_to
+from merl.acting.still import StillEnv
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
 from merl.core.files import cause
 from merl.core.output import tolerate_lost_output
@@ -279,25 +280,6 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
             set_environment_state(self.env, states[self._index])
 
 
-class _StandIn(gymnasium.Env[Any, Any]):
-    """A dummy environment that only provides spaces.
-
-    Args:
-        expected: the spaces.
-        error: raised by `reset`. It tells why the real environment cannot be used; an exception
-            during the start of a worker would not reach the run.
-    """
-
-    def __init__(self, expected: EnvSpaces, error: MerlError | None = None) -> None:
-        self.observation_space, self.action_space = expected.observation, expected.action
-        self._error = error
-
-    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
-        if self._error is not None:
-            raise self._error
-        raise NotImplementedError
-
-
 @dataclass
 class _Maker:
     """A function that makes an environment in a worker process."""
@@ -314,7 +296,7 @@ class _Maker:
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
         if self.here is not None:
-            return _StandIn(self.expected)
+            return StillEnv(self.expected)
         belong_to(self.parent)
         if imports_code(self.recipe.task):
             set_value(self.safe_path)
@@ -327,7 +309,8 @@ class _Maker:
             self.expected.check(EnvSpaces.of(env), f"that of worker {self.index}")
         except MerlError as error:
             env.close()
-            env = _StandIn(self.expected, EnvironmentFailed(str(error)))
+            # An exception during the start of a worker would not reach the run.
+            env = StillEnv(self.expected, EnvironmentFailed(str(error)))
         return _Worker(env, self.index)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from merl.replay import ReplayBuffer
 from merl.runs import checkpoint
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.checkpoint_folders import discard_later
-from merl.runs.plain import to_plain
 from merl.runs.run import Run
 from merl.training.evaluator import Evaluations
 from merl.training.loop import Progress
@@ -85,7 +84,6 @@ class Saver:
                 "environment": self._environment_states(),
                 "seconds": self._clock.seconds(),
                 "cpu_seconds": self._clock.cpu_seconds(),
-                "env": to_plain(setup.config.env),
             }
             checkpoint.save(
                 self._run.checkpoints,
@@ -129,8 +127,7 @@ class Saver:
                 setup.progress = Progress(**counts)
                 setup.randomness.load_state_dict(state["randomness"])
                 self._replay.load_state_dict(state["replay"], skip_damaged=skip_damaged)
-                states = state["environment"]
-                self._states = states if isinstance(states, list) else [states]
+                self._states = state["environment"]
                 self._environments.restore(self._states)
                 self._clock.restore(float(state["seconds"]), float(state["cpu_seconds"]))
             self._start = start

@@ -21,7 +21,7 @@ from merl.acting.instances import EnvSpaces
 from merl.acting.run_env import make_run_env, recipe, run_spaces, run_spec
 from merl.acting.still import StillEnvs
 from merl.acting.workers import WorkerEnvs, check_sendable
-from merl.agents import AGENTS, make_agent
+from merl.agents import imitates, make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
 from merl.agents.networks import make_networks, user_encoders
 from merl.config import CUSTOM, Source, TrainConfig
@@ -124,8 +124,7 @@ class Setup:
     @property
     def imitates(self) -> bool:
         """Whether the agent learns from demonstrations alone."""
-        kind = AGENTS.get(self.config.agent_name)
-        return kind is not None and kind.imitates
+        return imitates(self.config.agent_name)
 
     def batches_from(
         self, replay: ReplayBuffer, corrections: Corrections | None
@@ -231,9 +230,8 @@ def load_demos(
     Raises:
         MerlError: they cannot be read, do not fit the run, or are not those that it began with.
     """
-    agent = AGENTS.get(config.agent_name)
     if config.demos is None:
-        if agent is not None and agent.imitates:
+        if imitates(config.agent_name):
             raise MerlError(
                 f"agent {config.agent_name} learns from demonstrations alone: name a folder of "
                 "them with --demos; `merl demos record` makes one"

@@ -12,6 +12,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import psutil
 import pytest
@@ -54,6 +55,13 @@ def _importable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.syspath_prepend(FOLDER)
     monkeypatch.setenv("PYTHONPATH", FOLDER, prepend=os.pathsep)
     monkeypatch.setenv("TURNS", str(tmp_path))
+
+
+@pytest.fixture(autouse=True)
+def _the_log_level_of_gymnasium_is_restored() -> Iterator[None]:
+    before = gymnasium.logger.min_level
+    yield
+    assert gymnasium.logger.min_level == before
 
 
 @pytest.fixture(scope="module")

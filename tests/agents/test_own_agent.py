@@ -21,6 +21,7 @@ from merl.runs.run import Run
 from merl.training.loop import StepResult
 
 TASK, NAME = "merl.envs.dot:whole", "small_agent:SmallAgent"
+LOSS = '"value_loss": value_loss.detach()'
 GUIDE = Path(__file__).parents[2] / "docs" / "howto" / "agent.md"
 _FLAGS = {
     "--preset": "smoke",
@@ -182,6 +183,9 @@ def test_the_agent_of_an_untrusted_run_is_not_imported(
         (NAME, ("tuple(observation_space)", '("eye",)'), "senses is ('eye',): return a tuple of"),
         (NAME, (".to(device)", ".to(devise)"), "cannot be made: NameError: name 'devise' is not"),
         (NAME, ("action.clamp(-1, 1)", "action[0]"), "returned shape (2,): return (1, 2), one"),
+        (NAME, (f"return {{{LOSS}", f"{{{LOSS}"), f"update() of agent {NAME!r} returned None: re"),
+        (NAME, (LOSS, LOSS.replace(".detach()", ".item()")), "of scalar tensors"),
+        (NAME, (LOSS, f"{LOSS}[None]"), "returned {'value_loss': tensor(["),
         ("merl", ("", ""), "unrecognized options: --agent.hidden"),
     ],
 )

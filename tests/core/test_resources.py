@@ -96,12 +96,6 @@ def test_reserving_keeps_the_content_and_appends_zeros(tmp_path, monkeypatch, co
     assert file.stat().st_size == 3_000_000
 
 
-def test_reserving_without_posix_fallocate(tmp_path, monkeypatch):
-    monkeypatch.delattr(os, "posix_fallocate")
-    reserve_file(tmp_path / "file", 1000)
-    assert (tmp_path / "file").read_bytes() == bytes(1000)
-
-
 def test_a_full_disk_restores_the_length_of_the_file(tmp_path, monkeypatch):
     def refuse(*_: int) -> None:
         raise OSError(errno.EOPNOTSUPP, "not supported")

@@ -6,16 +6,20 @@ import dataclasses
 import json
 import random
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 
+from merl.acting.rollout import FrameStack
 from merl.core import MerlError
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.episode import Episode, EpisodeRecording
 from merl.demos.recorder import Recorder
+from merl.modalities import modalities_of
 from merl.replay import ReplayConfig
 from merl.replay.mixing import INTENDED
 
@@ -120,6 +124,30 @@ def test_keys_that_the_agent_does_not_use_are_left_out(demos: Demonstrations) ->
     joint = spaces.Dict({"joint": OBSERVATION["joint"]})
     batch = demos.load(CONFIG, joint, ACTION).sample(2, np.random.default_rng(0))
     assert sorted(batch.observation) == ["intended action", "joint"]
+
+
+def test_depth_is_stored_as_a_run_stores_its_own(tmp_path: Path) -> None:
+    """Both types; the bounds of the run, which may be others, scale it."""
+    recorded = {
+        "metres": spaces.Box(0.0, 3.0, (8, 8, 1), np.float32),
+        "millimetres": spaces.Box(0, 5000, (8, 8, 1), np.uint16),
+    }
+    rng, one = np.random.default_rng(0), episode(4)
+    seen: dict[str, NDArray[Any]] = {
+        "metres": rng.uniform(0, 3, (5, 8, 8, 1)).astype(np.float32),
+        "millimetres": rng.integers(0, 5001, (5, 8, 8, 1), np.uint16),
+    }
+    recorder = Recorder(tmp_path / "demos", "a", "b", spaces.Dict(recorded), ACTION)
+    recorder.add(dataclasses.replace(one, observations=seen))
+    space = spaces.Dict(recorded | {"metres": spaces.Box(0.5, 2.0, (8, 8, 1), np.float32)})
+    replay = recorder.demonstrations.load(CONFIG, space, ACTION)
+    stack = FrameStack(modalities_of(space), 2, torch.device("cpu"))
+    for step in range(5):
+        own = stack.push({key: values[step] for key, values in seen.items()})
+        at = np.flatnonzero(replay.arrays["timestep"])[step]
+        for key, frame in own.items():
+            assert frame.dtype == np.int16
+            np.testing.assert_array_equal(replay.arrays[f"observation.{key}"][at], frame)
 
 
 def test_the_digest_changes_with_any_byte(demos: Demonstrations) -> None:

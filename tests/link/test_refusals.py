@@ -129,6 +129,9 @@ def test_actors_that_do_not_fit_are_refused(
         os.kill(actor.pid or 0, signal.SIGTERM)
         actor.join(60)
         assert actor.exitcode == 128 + signal.SIGTERM, sides.output("actor")
+        (sides.run / "actors.json").write_text("[")
+        assert "actors.json is damaged (" in refused(*connect, "counting_here:make")
+        assert "actors.json is damaged (" in flat(sides.output("learner"))
         (sides.run / "actors.json").write_text("[null]")  # its spool is lost
         assert "observation 'joint' is nan" in refused(*connect, "others:nan", code=3)
     finally:

@@ -229,6 +229,18 @@ def test_check_does_not_call_a_file_damaged_that_cannot_be_read(
         assert one_line(ended.err), (name, ended.err)
 
 
+def test_check_names_missing_metrics_without_which_a_run_resumes(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = copy_of(finished, tmp_path)
+    (copy / "metrics.csv").unlink()
+    assert main(["check", str(copy)]) == 1
+    (found,) = [each for each in capsys.readouterr().out.splitlines() if "DAMAGED" in each]
+    assert found.startswith(f"DAMAGED: {copy / 'metrics.csv'} is gone: the metrics so far are lost")
+    assert resume(copy) == 0
+    assert main(["check", str(copy)]) == 0
+
+
 def test_check_changes_nothing_and_refuses_a_run_in_training(
     runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

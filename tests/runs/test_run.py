@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 
 from merl.cli import main
-from merl.config import TrainConfig
+from merl.config import CUSTOM, TrainConfig
 from merl.core import CONFIG_FILE, MerlError
 from merl.experiments.presets import compose
 from merl.runs.run import Run
-from merl.runs.run_folder import LOCK_FILE, check_links
+from merl.runs.run_folder import LOCK_FILE, check_links, create_folder
 from toy import DotEnv
 
 CONFIG = compose("smoke", "reach_duplo")
@@ -252,3 +252,16 @@ def test_a_config_with_too_deep_nesting_is_refused_in_one_line(tmp_path: Path) -
     (tmp_path / "config.json").write_text("[" * 100_000)
     with pytest.raises(MerlError, match="cannot be read"):
         Run.open(tmp_path)
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("run_dir", [None, Path("runs/mine")])
+def test_a_folder_of_runs_that_is_a_dangling_link_is_named_in_one_line(
+    run_dir: Path | None, tmp_path: Path
+) -> None:
+    (tmp_path / "runs").symlink_to(tmp_path / "nowhere")
+    config = dataclasses.replace(CONFIG, run_dir=run_dir)
+    with pytest.raises(MerlError, match=r"runs is a link to a folder that does not exist: create"):
+        create_folder(config, CUSTOM, tmp_path)
+    (tmp_path / "nowhere").mkdir()
+    assert create_folder(config, CUSTOM, tmp_path)[1]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 import merl
@@ -14,6 +15,7 @@ from merl.core import CallbackFailed, MerlError
 from merl.demos.demonstrations import Demonstrations
 from merl.demos.recorder import Recorder
 from merl.evaluation.demonstrating import record_episodes
+from merl.replay import ReplayBuffer
 from merl.training.trainer import Trainer
 from toy import DotEnv
 
@@ -39,23 +41,42 @@ class Person(merl.Callback):
         self.executed = self.trainer.replay.arrays["action"].copy()
 
 
-@pytest.fixture
-def demos(tmp_path: Path) -> Path:
+def record(folder: Path, task: str, env: DotEnv) -> Path:
     """Record two episodes in which nothing moves."""
-    env, folder = DotEnv(), tmp_path / "demos"
-    recorder = Recorder(folder, "toy:DotEnv", "a test", env.observation_space, env.action_space)
+    recorder = Recorder(folder, task, "a test", env.observation_space, env.action_space)
     for episode in record_episodes(lambda _: np.zeros(1), env, episodes=2, failures=True):
         recorder.add(episode)
     return folder
 
 
+@pytest.fixture
+def demos(tmp_path: Path) -> Path:
+    return record(tmp_path / "demos", "toy:DotEnv", DotEnv())
+
+
 def train(demos: Path | None, person: merl.Callback, steps: int = 40, **values: Any) -> Path:
-    run = Path(values.pop("run", "run"))
-    merl.train(
-        "toy:DotEnv", demos=demos, steps=steps, run_dir=str(run), callbacks=[person], **TINY,
-        **values,
-    )  # fmt: skip
+    run, task = Path(values.pop("run", "run")), values.pop("task", "toy:DotEnv")
+    given = TINY | values
+    merl.train(task, demos=demos, steps=steps, run_dir=str(run), callbacks=[person], **given)
     return run
+
+
+class Seeing(DotEnv):
+    """The dot, seen by depth cameras of two types."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        depths = {
+            "metres": spaces.Box(0.1, 2.0, (24, 24, 1), np.float32),
+            "millimetres": spaces.Box(0, 5000, (24, 24, 1), np.uint16),
+        }
+        self.observation_space = spaces.Dict({"joint": self.observation_space["joint"], **depths})
+
+    def _observe(self) -> dict[str, Any]:
+        metres = np.linspace(0, 2.2, 576, dtype=np.float32).reshape(24, 24, 1) + np.float32(self.x)
+        millimetres = np.rint(1000 * metres.clip(0, 5)).astype(np.uint16)
+        joint = super()._observe()["joint"]
+        return {"joint": joint, "metres": metres, "millimetres": millimetres}
 
 
 @pytest.fixture(autouse=True)
@@ -164,3 +185,50 @@ def test_a_person_who_fails_is_named(demos: Path) -> None:
 
     with pytest.raises(CallbackFailed, match=r"Failing\.correct raised .*the gamepad is gone"):
         train(demos, Failing())
+
+
+class Comparing(Person):
+    """Keeps the depth frames of the corrections and of the run, by what was seen with them."""
+
+    def on_end(self, outcome: Any) -> None:
+        corrections = self.trainer._corrections
+        assert corrections is not None
+        self.corrected, self.own = frames(corrections.replay), frames(self.trainer.replay)
+
+
+def frames(replay: ReplayBuffer) -> dict[tuple[Any, ...], NDArray[np.int16]]:
+    """Return the frames by their key and the joint vector at that time."""
+    arrays = replay.arrays
+    joints = arrays["observation.joint"].tolist()
+    return {
+        (key, *joints[at]): arrays[f"observation.{key}"][at].copy()
+        for key in ("metres", "millimetres")
+        for at in np.flatnonzero(arrays["timestep"])
+    }
+
+
+def test_depth_of_corrections_is_that_of_the_runs_own_experience(tmp_path: Path) -> None:
+    task, folder = f"{__name__}:Seeing", tmp_path / "demos"
+    keys: dict[str, Any] = {"agent.keys": ("joint", "metres", "millimetres")}
+    keys["agent.latent_dim"] = 24
+    before, after = Comparing(3, 4, 5), Comparing(22, 23)
+    run = train(record(folder, task, Seeing()), before, steps=20, task=task, **keys)
+    merl.resume(run, steps=40, callbacks=[after], progress=False)
+    for person, observations in ((before, 4), (after, 4 + 3)):
+        assert len(person.corrected) == 2 * observations
+        for at, frame in person.corrected.items():
+            np.testing.assert_array_equal(frame, person.own[at])
+
+
+@pytest.mark.parametrize(("capacity", "expected"), [(100, 40), (12, 12)])
+def test_corrections_take_no_more_memory_than_the_run_can_fill(
+    capacity: int, expected: int, demos: Path
+) -> None:
+    class Measuring(Person):
+        def on_start(self, trainer: Trainer) -> None:
+            super().on_start(trainer)
+            assert trainer._corrections is not None
+            assert trainer._corrections.replay.spec.capacity == expected
+
+    run = train(demos, Measuring(*range(40)), **{"replay.capacity": capacity})
+    assert Demonstrations.open(run / "corrections").steps == 40

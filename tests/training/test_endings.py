@@ -20,6 +20,7 @@ import merl
 import unruly_envs
 from merl.cli import main
 from merl.report.curves import read_metrics
+from merl.runs.checkpoint import Checkpoint
 from merl.training.evaluator import ATTEMPTS
 from merl.training.timing import Arithmetic, Timing
 from unruly_envs import DEFAULT, unruly
@@ -121,6 +122,27 @@ def test_resume_repeats_a_failed_last_evaluation() -> None:
     assert merl.load_policy("run").step == 60
     assert main(["resume", "run"]) == 0
     assert evaluated() == [60]
+
+
+def test_a_resumed_run_that_fails_before_its_first_step_keeps_the_scores() -> None:
+    def fails(env: Any, seed: int | None) -> None:
+        if seed is None:  # not in evaluations
+            raise OSError("the arm is locked")
+
+    def scores() -> dict[int, float | None]:
+        found = map(Checkpoint.open, Path("run/checkpoints").iterdir())
+        return {each.step: each.score for each in found}
+
+    assert train() == 0
+    before, best = scores(), Checkpoint.find(Path("run/checkpoints"), "best")
+    assert before[60] is not None
+    manifest = Path("run/checkpoints/00000060/manifest.json")
+    written = manifest.stat().st_mtime_ns
+    unruly.on_reset = fails
+    assert main(["resume", "run", "--steps", "80"]) == 4
+    assert scores() == before
+    assert Checkpoint.find(Path("run/checkpoints"), "best") == best
+    assert manifest.stat().st_mtime_ns > written
 
 
 def test_an_evaluation_that_is_killed_repeatedly_is_skipped(

@@ -60,7 +60,11 @@ def evaluation_of(value: float) -> Evaluation:
 
 def new_run(steps: int = 1000, minutes: float | None = None, path: Path = Path("nowhere")) -> Any:
     config = SimpleNamespace(
-        steps=steps, minutes=minutes, seed_steps=100, eval=SimpleNamespace(every=250)
+        steps=steps,
+        minutes=minutes,
+        seed_steps=100,
+        num_envs=1,
+        eval=SimpleNamespace(every=250),
     )
     return SimpleNamespace(config=config, path=path)
 
@@ -218,6 +222,17 @@ def test_a_training_episode_without_a_success_report_counts_as_failed() -> None:
     for step, metrics in enumerate((METRICS, *[without_report] * 3)):
         show_step(view, StepResult(step, 0), metrics)
     assert "success 25%" in drawn(view)
+
+
+@pytest.mark.parametrize("missing", ["learn/q", "learn/critic_loss"])
+def test_an_agent_that_does_not_report_both_is_shown_without_them(missing: str) -> None:
+    view = LiveView(console_of(terminal=False))
+    view.on_start(trainer_of(new_run(), 0))
+    reported = {name: value for name, value in METRICS.items() if name != missing}
+    show_step(view, StepResult(200, 100), reported)
+    assert "learner" not in drawn(view)
+    show_step(view, StepResult(201, 101), METRICS)
+    assert "learner Q 4.50, critic loss 0.25" in drawn(view)
 
 
 def test_a_resumed_run_shows_its_earlier_evaluations(tmp_path: Path) -> None:

@@ -353,7 +353,7 @@ def test_an_episode_sums_its_steps() -> None:
     failed = {"success_end": 0.0, "success_any": 0.0, "success_share": 0.0}
     assert silent.metrics(reports_success=True) == silent.metrics() | failed
     assert mean_metrics([silent, silent], reports_success=True) == silent.metrics() | failed
-    assert mean_metrics([silent, episode])["success_any"] == 0.5
+    assert mean_metrics([silent, episode], reports_success=True)["success_any"] == 0.5
 
 
 def test_the_success_share_counts_only_steps_with_a_report() -> None:

@@ -6,8 +6,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -35,8 +36,10 @@ class WorkerDied(Exception):  # noqa: N818 (the run restarts the workers)
     """A worker process died or does not answer: the episodes in progress are lost."""
 
 
-class Environments(Protocol):
+class Environments(ABC):
     """One or several environments that step together.
+
+    Where there is nothing to send, restore, restart or close, these methods stay as they are here.
 
     Attributes:
         count: number of environments.
@@ -46,6 +49,7 @@ class Environments(Protocol):
     count: int
     action_shape: tuple[int, ...]
 
+    @abstractmethod
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
         """Start an episode in each of the given environments.
 
@@ -59,46 +63,41 @@ class Environments(Protocol):
         Raises:
             WorkerDied: a process died or did not answer.
         """
-        ...
 
-    def send(self, actions: NDArray[np.float32]) -> None:
+    def send(self, actions: NDArray[np.float32]) -> None:  # noqa: B027
         """Start a step in every environment with its action, (count, A) in [-1, 1].
 
         Raises:
             WorkerDied: a process died.
         """
-        ...
 
+    @abstractmethod
     def receive(self) -> list[Step]:
         """Wait for all environments and return the results of their steps.
 
         Raises:
             WorkerDied: a process died or did not answer in time.
         """
-        ...
 
+    @abstractmethod
     def states(self) -> list[dict[str, Any]]:
         """Return the `environment_state()` of each environment."""
-        ...
 
-    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:  # noqa: B027
         """Restore from `states()`."""
-        ...
 
-    def restart(self) -> None:
+    def restart(self) -> None:  # noqa: B027
         """Start all environments again after one was lost.
 
         Raises:
             WorkerDied: they cannot be started.
         """
-        ...
 
-    def close(self) -> None:
-        """Close all environments."""
-        ...
+    def close(self) -> None:  # noqa: B027
+        """Close all environments that this object has made."""
 
 
-class InProcessEnvs:
+class InProcessEnvs(Environments):
     """One environment in this process; it steps inside `receive`.
 
     Args:
@@ -137,9 +136,3 @@ class InProcessEnvs:
     def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
         """See `Environments`."""
         set_environment_state(self._env, states[0])
-
-    def restart(self) -> None:
-        """Do nothing: an environment in this process is never lost."""
-
-    def close(self) -> None:
-        """See `Environments`."""

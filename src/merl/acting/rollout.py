@@ -170,9 +170,8 @@ def report_success(episodes: Sequence[Episode]) -> bool:
     return any(episode.success is not None for episode in episodes)
 
 
-def mean_metrics(episodes: Sequence[Episode], *, reports_success: bool = False) -> dict[str, float]:
+def mean_metrics(episodes: Sequence[Episode], *, reports_success: bool) -> dict[str, float]:
     """Return the mean metrics of episodes that ended at the same step; see `Episode.metrics`."""
-    reports_success = reports_success or report_success(episodes)
     each = [episode.metrics(reports_success=reports_success) for episode in episodes]
     return {
         name: fmean(metrics[name] for metrics in each if name in metrics)

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from merl.acting.environments import Step
-from merl.core import Observation
+from merl.acting.environments import Environments, Step
+from merl.acting.instances import EnvSpaces
+from merl.core import MerlError, Observation
 
 EPISODE = 250
 """Steps of an episode: how often a run logs, and may evaluate and save."""
 
 
-class StillEnvs:
-    """Environments whose observations and rewards are all 0; see `Environments`.
+class StillEnvs(Environments):
+    """Environments whose observations and rewards are all 0.
 
     Args:
         space: the observation space.
@@ -38,9 +38,6 @@ class StillEnvs:
         self._steps = 0  # all episodes begin and end together
         return dict.fromkeys(seeds, self._zeros)
 
-    def send(self, actions: NDArray[np.float32]) -> None:
-        """Do nothing."""
-
     def receive(self) -> list[Step]:
         """See `Environments`."""
         self._steps += 1
@@ -50,30 +47,20 @@ class StillEnvs:
         """See `Environments`; there are no random numbers to restore."""
         return [{"bit_generator": None}] * self.count
 
-    def restore(self, states: Sequence[Mapping[str, Any] | None]) -> None:
-        """Do nothing."""
-
-    def restart(self) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
 
 class StillEnv(gymnasium.Env[Any, Any]):
-    """An environment that only has spaces, those of an environment on another machine.
+    """An environment that only has spaces: those of one on another machine, or that cannot be used.
 
     Args:
-        space: the observation space, in the form that agents use.
-        action_space: the action space, in [-1, 1].
-        bounds: see `merl.acting.run_env.own_bounds`.
+        known: the spaces.
+        error: raised by `reset`.
     """
 
-    def __init__(
-        self,
-        space: spaces.Dict,
-        action_space: spaces.Box,
-        bounds: tuple[list[float], list[float]] | None,
-    ) -> None:
-        self.observation_space, self.action_space = space, action_space
-        self.own_bounds = bounds
+    def __init__(self, known: EnvSpaces, error: MerlError | None = None) -> None:
+        self.observation_space, self.action_space = known.observation, known.action
+        self.own_bounds = known.bounds
+        self._error = error or MerlError("this environment only has spaces")
+
+    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+        """Raise the error."""
+        raise self._error

@@ -20,7 +20,7 @@ from gymnasium.vector.async_vector_env import AsyncState
 from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 
-from merl.acting.environments import Step, WorkerDied
+from merl.acting.environments import Environments, Step, WorkerDied
 from merl.acting.generators import (
     environment_state,
     seed_global_generators,
@@ -28,6 +28,7 @@ from merl.acting.generators import (
 )
 from merl.acting.instances import EnvRecipe, EnvSpaces, with_keys
 from merl.acting.processes import Processes, belong_to
+from merl.acting.still import StillEnv
 from merl.core import EnvironmentFailed, EnvironmentsLost, MerlError, Observation
 from merl.core.files import cause
 from merl.core.output import tolerate_lost_output
@@ -45,7 +46,7 @@ END_SECONDS = 5.0
 """Time limit within which the processes must have ended; after that they are killed."""
 
 
-class WorkerEnvs:
+class WorkerEnvs(Environments):
     """Environments in worker processes that step in parallel.
 
     The processes are spawned (a fork with OpenGL or threads hangs), return observations through
@@ -69,11 +70,15 @@ class WorkerEnvs:
         self.count, self.action_shape = count, here.action_space.shape or ()
         self._recipe, self._here, self._timeout = recipe, here, timeout
         self._lost: str | None = None  # why a process is lost
+        self._level = gymnasium.logger.min_level  # of the caller
         try:
             self._env = self._started()
-        except WorkerDied as lost:
+        except BaseException as error:
+            gymnasium.logger.min_level = self._level
+            if not isinstance(error, WorkerDied):
+                raise
             raise EnvironmentsLost(
-                f"an environment's process {lost} while it started: see its output above"
+                f"an environment's process {error} while it started: see its output above"
             ) from None
 
     def reset(self, seeds: Mapping[int, int | None]) -> dict[int, Observation]:
@@ -122,6 +127,7 @@ class WorkerEnvs:
     def close(self) -> None:
         """See `Environments`."""
         _end(self._env)
+        gymnasium.logger.min_level = self._level
 
     @contextmanager
     def _loss(self) -> Iterator[None]:
@@ -274,25 +280,6 @@ class _Worker(gymnasium.Wrapper[Any, Any, Any, Any]):
             set_environment_state(self.env, states[self._index])
 
 
-class _StandIn(gymnasium.Env[Any, Any]):
-    """A dummy environment that only provides spaces.
-
-    Args:
-        expected: the spaces.
-        error: raised by `reset`. It tells why the real environment cannot be used; an exception
-            during the start of a worker would not reach the run.
-    """
-
-    def __init__(self, expected: EnvSpaces, error: MerlError | None = None) -> None:
-        self.observation_space, self.action_space = expected.observation, expected.action
-        self._error = error
-
-    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
-        if self._error is not None:
-            raise self._error
-        raise NotImplementedError
-
-
 @dataclass
 class _Maker:
     """A function that makes an environment in a worker process."""
@@ -309,7 +296,7 @@ class _Maker:
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
         if self.here is not None:
-            return _StandIn(self.expected)
+            return StillEnv(self.expected)
         belong_to(self.parent)
         if imports_code(self.recipe.task):
             set_value(self.safe_path)
@@ -322,7 +309,8 @@ class _Maker:
             self.expected.check(EnvSpaces.of(env), f"that of worker {self.index}")
         except MerlError as error:
             env.close()
-            env = _StandIn(self.expected, EnvironmentFailed(str(error)))
+            # An exception during the start of a worker would not reach the run.
+            env = StillEnv(self.expected, EnvironmentFailed(str(error)))
         return _Worker(env, self.index)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -56,6 +56,11 @@ METHODS = ("act", "update", "state_dict", "load_state_dict", "load_policy")
 HELP = "docs/howto/agent.md describes what an agent needs"
 
 
+def imitates(name: str) -> bool:
+    """Return whether the agent of that name learns from demonstrations alone; a user's does not."""
+    return name in AGENTS and AGENTS[name].imitates
+
+
 def find_agent(name: str, *folders: Path) -> AgentKind:
     """Return the agent of that name.
 

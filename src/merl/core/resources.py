@@ -8,7 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import chdir, suppress
+from contextlib import chdir
 from importlib import import_module
 from pathlib import Path
 
@@ -114,12 +114,11 @@ def reserve_holes(file: int) -> None:
     found = os.fstat(file)
     if found.st_blocks * 512 >= found.st_size:
         return
-    with suppress(AttributeError):  # macOS
-        try:
-            os.posix_fallocate(file, 0, found.st_size)
-        except OSError as error:
-            if error.errno not in _CANNOT_RESERVE:
-                raise
+    try:
+        os.posix_fallocate(file, 0, found.st_size)
+    except OSError as error:
+        if error.errno not in _CANNOT_RESERVE:
+            raise
 
 
 def _allocate(file: int, start: int, end: int) -> None:
@@ -127,8 +126,6 @@ def _allocate(file: int, start: int, end: int) -> None:
     try:
         os.posix_fallocate(file, start, end - start)
         return
-    except AttributeError:  # macOS
-        pass
     except OSError as error:
         if error.errno not in _CANNOT_RESERVE:
             raise

@@ -11,7 +11,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -30,9 +29,8 @@ _LAST = 0.3
 
 
 def end_with_parent(number: int) -> None:
-    """Let the system send this process a signal when its parent process dies; only Linux can."""
-    with suppress(AttributeError):
-        _LIBC.prctl(_PR_SET_PDEATHSIG, number)
+    """Let the system send this process a signal when its parent process dies."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, number)
 
 
 @contextmanager
@@ -65,11 +63,7 @@ def new_log() -> int:
     Raises:
         OSError: it cannot be made.
     """
-    try:
-        log: int = _LIBC.memfd_create(b"merl-signals", _MFD_CLOEXEC)  # `os` may lack it
-    except AttributeError:  # macOS
-        with tempfile.TemporaryFile() as file:
-            log = os.dup(file.fileno())
+    log: int = _LIBC.memfd_create(b"merl-signals", _MFD_CLOEXEC)  # `os` may lack it
     os.set_blocking(log, False)
     return log
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from merl.core import MerlError, Transition, counted
 from merl.core.files import cause, open_file, read_json, reporting
 from merl.core.user_code import in_one_line
 from merl.demos.episode import Episode, check_episode
+from merl.modalities import modalities_of
 from merl.replay import ReplayBuffer, ReplayConfig, ReplaySpec
 from merl.replay.mixing import INTENDED
 from merl.runs.plain import box, describe, told
@@ -209,9 +210,9 @@ class Demonstrations:
         return replay
 
 
-def store(episode: Episode, replay: ReplayBuffer, keys: Iterable[str]) -> None:
-    """Write an episode, with these keys of its observations, into a replay buffer."""
-    stored = {key: episode.observations[key] for key in keys}
+def store(episode: Episode, replay: ReplayBuffer, space: spaces.Dict) -> None:
+    """Write an episode, with the observation keys of `space`, into a replay buffer."""
+    stored = {k: m.to_stored(episode.observations[k]) for k, m in modalities_of(space).items()}
     after = np.zeros_like(episode.intended[:1])  # there is no action after the last step
     stored[INTENDED] = np.concatenate([episode.intended, after])
     replay.begin({key: values[0] for key, values in stored.items()})

@@ -11,7 +11,7 @@ from typing import Any, get_args
 import torch
 import tyro
 
-from merl.agents import AGENTS, find_agent
+from merl.agents import AGENTS, find_agent, imitates
 from merl.agents.config import AgentConfig
 from merl.config import EvaluationConfig, Setting, TrainConfig, override
 from merl.core import MerlError, check_choice
@@ -222,7 +222,7 @@ def compose(
     config = override(
         config, chosen.for_user_env if config.has_user_env else {"eval.references": True}
     )
-    if name in AGENTS and AGENTS[name].imitates:
+    if imitates(name):
         config = override(config, IMITATING)
     values = _agent_values(base, preset, config) if isinstance(base, AgentConfig) else {}
     if setting == "published":

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from merl.core import MerlError
+from merl.core import MerlError, counted
 from merl.core.files import read_json, replace_file, reporting
 from merl.link.protocol import Channel
 from merl.runs.run_folder import ACTORS_FILE
@@ -35,11 +35,11 @@ def place_of(actor: str, run: Path, count: int) -> int:
     """Return the place of an actor; a new one takes a free place.
 
     Raises:
-        MerlError: all places are taken by others, or their list cannot be read or written.
+        MerlError: all places are taken by others, or their list is damaged or cannot be read or
+            written.
     """
     file = run / ACTORS_FILE
-    with reporting(f"{file} cannot be read"):
-        names: list[Any] = read_json(file) if file.exists() else []
+    names = _names(file, count)
     if actor in names:
         return names.index(actor)
     if None not in names:
@@ -54,3 +54,18 @@ def place_of(actor: str, run: Path, count: int) -> int:
     with reporting(f"{file} cannot be written"):
         replace_file(file, json.dumps(names).encode())
     return place
+
+
+def _names(file: Path, most: int) -> list[Any]:
+    """Return the actor of each place that was taken; None if it is free again."""
+    try:
+        with reporting(f"{file} cannot be read"):
+            names = read_json(file) if file.exists() else []
+        if not isinstance(names, list) or len(names) > most:
+            raise TypeError(f"it is no list of at most {counted(most, 'actor')}")
+    except (ValueError, TypeError) as error:
+        raise MerlError(
+            f"{file} is damaged ({error}): restore it from a copy, or write a list with null for "
+            "each actor"
+        ) from None
+    return names

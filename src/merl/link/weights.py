@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from merl.agents import AGENTS
+from merl.agents import imitates
 from merl.agents.ddpg import DDPG
 from merl.agents.networks import user_encoders
 from merl.config import TrainConfig
@@ -23,8 +23,7 @@ def check_can_act(config: TrainConfig) -> None:
         MerlError: its agent or one of its encoders is the user's own class, or the agent only
             imitates.
     """
-    kind = AGENTS.get(config.agent_name)
-    if kind is not None and kind.imitates:
+    if imitates(config.agent_name):
         raise MerlError(
             f"agent {config.agent_name} learns from demonstrations alone, and needs no actor: "
             "train it with `merl train`"

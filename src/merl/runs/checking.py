@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from merl.core import LOCK_FILE, METRICS_FILE, MerlError, counted
-from merl.core.files import cause, is_damage, open_file, reporting
+from merl.core.files import cause, is_damage, is_gone, open_file, reporting
 from merl.replay import ReplaySpec
 from merl.replay.damage import find_damage
 from merl.runs.checkpoint import Checkpoint, Unreadable, readable
@@ -43,13 +43,20 @@ def check_run(run: Run) -> Iterator[Finding]:
                 yield Finding(True, f"{path} is sound")
             except MerlError as error:
                 yield damage_of(error)
-        try:
-            rows = counted(len(read_rows(run.path / METRICS_FILE)[1]), "row")
-            yield Finding(True, f"{run.path / METRICS_FILE} can be read: {rows}")
-        except MerlError as error:
-            yield damage_of(error)
+        yield _check_metrics(run.path / METRICS_FILE, last)
         if last is not None:
             yield from _check_replay(run, last)
+
+
+def _check_metrics(file: Path, start: Checkpoint | None) -> Finding:
+    """Return whether the metrics can be read; they begin before the first checkpoint."""
+    try:
+        rows = read_rows(file)[1]
+    except MerlError as error:
+        return damage_of(error)
+    if start is not None and not rows and is_gone(file):
+        return Finding(False, f"{file} is gone: the metrics so far are lost, and nothing else")
+    return Finding(True, f"{file} can be read: {counted(len(rows), 'row')}")
 
 
 def _check_replay(run: Run, start: Checkpoint) -> Iterator[Finding]:

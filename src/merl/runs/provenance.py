@@ -58,8 +58,10 @@ def _processor_name() -> str:
 
 
 def commit() -> str | None:
-    """Return the commit of the source; None if merl does not run from a Git checkout."""
+    """Return the commit of the source; None if merl does not run from its own Git checkout."""
     source = Path(merl.__file__).parent
+    if not (source.parents[1] / ".git").exists():  # perhaps that of the project around a .venv
+        return None
     command = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)

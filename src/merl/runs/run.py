@@ -5,6 +5,7 @@ metrics.csv     the metrics, one row per episode and evaluation (authoritative)
 tensorboard/    the same metrics as TensorBoard events, with `--log tensorboard`
 checkpoints/    the checkpoints from which the run resumes
 replay/         the memory-mapped replay buffer
+corrections/    the steps that a person has corrected, as demonstrations
 videos/         one episode of each filmed evaluation
 curve.png       the learning curve, drawn when training ends
 """

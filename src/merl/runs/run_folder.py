@@ -109,7 +109,12 @@ def create_folder(config: TrainConfig, source: Source, home: Path | None) -> tup
             refuse_existing(path)
         try:
             path.mkdir(parents=True)
-        except FileExistsError:
+        except FileExistsError as error:
+            if Path(error.filename) != path:
+                raise MerlError(
+                    f"run folder {path} cannot be created: {error.filename} is a link to a folder "
+                    "that does not exist: create it, or name another with --run-dir"
+                ) from error
             if config.run_dir is None:
                 continue  # another process has just taken this name
             return path, False

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from merl.acting.instances import own_bounds
+from merl.acting.instances import EnvSpaces, own_bounds
 from merl.acting.rollout import Episode
 from merl.acting.still import StillEnv
 from merl.callbacks import Callback
@@ -110,9 +110,9 @@ class Actors(Callback):
                 while self._spaces is None:
                     self._changed.wait(WAIT)
                 described = self._spaces
-        space, action_space = record.spaces_of(described)
         bounds = described["action_space"]["own_bounds"]
-        return lambda: StillEnv(space, action_space, bounds)
+        known = EnvSpaces(*record.spaces_of(described), bounds)
+        return lambda: StillEnv(known)
 
     # Events of training ---------------------------------------------------------------------
 

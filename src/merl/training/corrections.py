@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from merl.acting.environments import Step
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 FOLDER = "corrections"
 """Folder of the corrections in a run's folder."""
 CAPACITY = 100_000
-"""Steps of corrections that are drawn; older ones stay in the folder alone."""
+"""Most steps of corrections that are drawn; older ones stay in the folder alone."""
 
 Correct = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -40,21 +41,24 @@ class Corrections:
 
     Args:
         correct: maps the agent's actions (N, A) to those that are executed.
-        demos: the replay of the demonstrations; the replay of the corrections is of its kind.
+        replay: an empty replay like that of the demonstrations.
         recorder: writes the corrections; those that its folder holds are read.
+        space: the run's observations, in whose bounds depth is stored.
 
     Attributes:
         replay: the corrections, to draw from.
     """
 
-    def __init__(self, correct: Correct, demos: ReplayBuffer, recorder: Recorder) -> None:
-        self.replay = ReplayBuffer(replace(demos.spec, capacity=CAPACITY))
+    def __init__(
+        self, correct: Correct, replay: ReplayBuffer, recorder: Recorder, space: spaces.Dict
+    ) -> None:
+        self.replay, self._space = replay, space
         self._correct, self._recorder = correct, recorder
         self._observations: dict[int, Observation] = {}  # the newest, by environment
         self._open: dict[int, EpisodeRecording] = {}  # stretches in progress, by environment
         self._actions: dict[int, NDArray[np.float32]] = {}  # of this step, where corrected
         for episode in recorder.demonstrations.episodes():
-            self._store(episode)
+            store(episode, replay, space)
 
     @classmethod
     @contextmanager
@@ -76,10 +80,10 @@ class Corrections:
             )
         config = setup.config
         options = {} if config.has_user_env else config.env.form
-        spaces = setup.space, setup.action_space
-        folder = run.path / FOLDER
-        recorder = Recorder(folder, config.task, "corrections", *spaces, options, append=True)
-        corrections = cls(correct.correct, setup.demos, recorder)
+        own, folder = (setup.space, setup.action_space), run.path / FOLDER
+        recorder = Recorder(folder, config.task, "corrections", *own, options, append=True)
+        spec = replace(setup.demos.spec, capacity=min(CAPACITY, config.capacity))
+        corrections = cls(correct.correct, ReplayBuffer(spec), recorder, setup.space)
         try:
             yield corrections
         finally:
@@ -121,8 +125,4 @@ class Corrections:
         if recording is not None and len(recording):
             episode = recording.finish(terminated=terminated)
             self._recorder.add(episode)
-            self._store(episode)
-
-    def _store(self, episode: Episode) -> None:
-        keys = self._recorder.demonstrations.observation_space
-        store(episode, self.replay, keys)
+            store(episode, self.replay, self._space)

@@ -112,7 +112,7 @@ class LiveView(Callback):
             f"{metrics['time/steps_per_second']:.0f} steps/s, "
             f"{metrics['time/updates_per_second']:.0f} updates/s"
         )
-        if "learn/q" in metrics:
+        if {"learn/q", "learn/critic_loss"} <= metrics.keys():  # a user's agent may lack one
             self._learner = (
                 f"Q {metrics['learn/q']:.2f}, critic loss {metrics['learn/critic_loss']:.2g}"
             )

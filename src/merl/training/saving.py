@@ -16,7 +16,6 @@ from merl.replay import ReplayBuffer
 from merl.runs import checkpoint
 from merl.runs.checkpoint import Checkpoint
 from merl.runs.checkpoint_folders import discard_later
-from merl.runs.plain import to_plain
 from merl.runs.run import Run
 from merl.training.evaluator import Evaluations
 from merl.training.loop import Progress
@@ -53,6 +52,7 @@ class Saver:
         self._environments, self._evaluations = environments, evaluations
         self._clock, self._guard, self._callbacks = clock, guard, callbacks
         self._saved: dict[str, Any] | None = None  # the progress at the last save
+        self._start: Checkpoint | None = None  # from which the run was resumed
         self._states: Sequence[Mapping[str, Any] | None] = [None] * environments.count
         self.interval = Interval(setup.config.save_every)
 
@@ -75,8 +75,6 @@ class Saver:
         setup, progress = self._setup, self._setup.progress
         if self._saved == dataclasses.asdict(progress):
             return True
-        last = self._evaluations.last
-        fresh = last is not None and progress.evaluated == progress.step
         try:
             self._replay.flush()  # if it writes the files again, the checksums change
             state = {
@@ -86,14 +84,13 @@ class Saver:
                 "environment": self._environment_states(),
                 "seconds": self._clock.seconds(),
                 "cpu_seconds": self._clock.cpu_seconds(),
-                "env": to_plain(setup.config.env),
             }
             checkpoint.save(
                 self._run.checkpoints,
                 progress.step,
                 setup.agent,
                 state,
-                score=last.returns.mean if fresh and last else None,
+                score=self._score(),
                 keep=setup.config.keep,
             )
         except OSError as error:
@@ -130,10 +127,10 @@ class Saver:
                 setup.progress = Progress(**counts)
                 setup.randomness.load_state_dict(state["randomness"])
                 self._replay.load_state_dict(state["replay"], skip_damaged=skip_damaged)
-                states = state["environment"]
-                self._states = states if isinstance(states, list) else [states]
+                self._states = state["environment"]
                 self._environments.restore(self._states)
                 self._clock.restore(float(state["seconds"]), float(state["cpu_seconds"]))
+            self._start = start
             discard_later(self._run.checkpoints, start.step)
         except WorkerDied as died:
             raise EnvironmentsLost(
@@ -148,6 +145,13 @@ class Saver:
         if self._setup.config.has_actors:
             return True
         return all(state and "bit_generator" in state for state in self._environment_states())
+
+    def _score(self) -> float | None:
+        """Return the mean return of the evaluation at this step; None if there was none."""
+        progress, last, start = self._setup.progress, self._evaluations.last, self._start
+        if last is not None and progress.evaluated == progress.step:
+            return last.returns.mean
+        return start.score if start is not None and start.step == progress.step else None
 
     def _environment_states(self) -> Sequence[Mapping[str, Any] | None]:
         """Return the states of the environments; after a worker died, the last known states."""

@@ -21,14 +21,16 @@ from merl.acting.instances import EnvSpaces
 from merl.acting.run_env import make_run_env, recipe, run_spaces, run_spec
 from merl.acting.still import StillEnvs
 from merl.acting.workers import WorkerEnvs, check_sendable
-from merl.agents import AGENTS, make_agent
+from merl.agents import imitates, make_agent
 from merl.agents.config import AgentConfig, ObservationConfig
-from merl.agents.networks import make_networks, user_encoders
+from merl.agents.ddpg import DDPG
+from merl.agents.networks import load_encoder_weights, make_networks, user_encoders
 from merl.config import CUSTOM, Source, TrainConfig
 from merl.core import Agent, MerlError, counted, user_code
 from merl.core.resources import available_memory, keep_freed_memory
 from merl.demos.demonstrations import Demonstrations
 from merl.envs.user_env import MakeEnv, load_module
+from merl.evaluation.policy import load_policy
 from merl.evaluation.video import MIN_SIDE
 from merl.replay import ReplayBuffer, ReplaySpec, check_fits
 from merl.replay.mixing import MixedReplay
@@ -124,8 +126,7 @@ class Setup:
     @property
     def imitates(self) -> bool:
         """Whether the agent learns from demonstrations alone."""
-        kind = AGENTS.get(self.config.agent_name)
-        return kind is not None and kind.imitates
+        return imitates(self.config.agent_name)
 
     def batches_from(
         self, replay: ReplayBuffer, corrections: Corrections | None
@@ -231,9 +232,8 @@ def load_demos(
     Raises:
         MerlError: they cannot be read, do not fit the run, or are not those that it began with.
     """
-    agent = AGENTS.get(config.agent_name)
     if config.demos is None:
-        if agent is not None and agent.imitates:
+        if imitates(config.agent_name):
             raise MerlError(
                 f"agent {config.agent_name} learns from demonstrations alone: name a folder of "
                 "them with --demos; `merl demos record` makes one"
@@ -270,6 +270,35 @@ def load_demos(
             "them, or name their folder with --demos"
         )
     return loaded, dataclasses.replace(config, demos=found.path, demos_hash=digest)
+
+
+def load_initial_weights(agent: Agent, home: Path) -> None:
+    """Load the weights that the agent's config names, into an agent that starts to train.
+
+    Args:
+        agent: the agent; only merl's own have such weights.
+        home: the folder to which names of files and runs are relative.
+
+    Raises:
+        MerlError: a file or a run cannot be read, or does not fit the agent.
+    """
+    if not isinstance(agent, DDPG):
+        return
+    load_encoder_weights(agent.networks, agent.config, home)
+    source = agent.config.start_from
+    if source is None:
+        return
+    other = load_policy(home / source).agent
+    try:
+        if not isinstance(other, DDPG):
+            raise RuntimeError("it is the policy of an agent of another kind")
+        agent.take_policy(other)
+    except RuntimeError as error:
+        first = str(error).split(":\n", 1)[-1].strip().splitlines()[0]
+        raise MerlError(
+            f"agent.start-from {source} does not fit: {first}: train both with the same keys, "
+            "encoders and sizes"
+        ) from None
 
 
 def choose_device(name: str) -> torch.device:

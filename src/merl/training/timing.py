@@ -137,7 +137,8 @@ def measure(
         device: device of the networks.
 
     Raises:
-        MerlError: the config asks for a compiled update, and compilation fails.
+        MerlError: the config asks for a compiled update, and compilation fails; or the update
+            returns no metrics.
     """
     cores = len(os.sched_getaffinity(0))
     threads = config.threads or (cores if device.type == "cuda" else 1)
@@ -157,7 +158,7 @@ def measure(
         try:
             with torch_settings(device):
                 agent = _agent(config, space, batch, device, arithmetic)
-                update[arithmetic] = _time_update(agent, batch, device)
+                update[arithmetic] = _time_update(config.agent_name, agent, batch, device)
         except Exception as error:
             if arithmetic.compiled:
                 raise _CompileError(error) from error
@@ -237,7 +238,7 @@ def _agent(
     return agent
 
 
-def _time_update(agent: Agent, batch: Batch, device: torch.device) -> float:
+def _time_update(name: str, agent: Agent, batch: Batch, device: torch.device) -> float:
     update: Update = lambda step: agent.update(batch, step=step)  # noqa: E731
     warm_up, repeats = 1, REPEATS  # the first update also initialises, e.g. the optimizers
     if device.type == "cuda" and isinstance(agent, Accelerable):  # as in training
@@ -246,12 +247,30 @@ def _time_update(agent: Agent, batch: Batch, device: torch.device) -> float:
         warm_up = Recorded.WARM_UP + 1
 
     def timed() -> None:
-        for value in update(0).values():
+        metrics = update(0)
+        _check_metrics(name, metrics)
+        for value in metrics.values():
             float(value)  # reading it waits for the device
 
     for _ in range(warm_up):
         timed()
     return _median_seconds(timed, repeats)
+
+
+def _check_metrics(name: str, metrics: Any) -> None:
+    """Check what the update of an agent, perhaps the user's own, has returned.
+
+    Raises:
+        MerlError: it is no dict of scalar tensors.
+    """
+    scalars = isinstance(metrics, Mapping) and all(
+        isinstance(value, torch.Tensor) and not value.shape for value in metrics.values()
+    )
+    if not scalars:
+        returned = " ".join(repr(metrics).split())[:80]
+        raise MerlError(
+            f"update() of agent {name!r} returned {returned}: return a dict of scalar tensors"
+        )
 
 
 class _CompileError(MerlError):

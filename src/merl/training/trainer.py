@@ -25,12 +25,11 @@ from merl.runs.run_folder import resume_line
 from merl.training.actors import Actors
 from merl.training.corrections import Corrections
 from merl.training.evaluator import Evaluations
-from merl.training.initial import load_initial_weights
 from merl.training.loop import Collector, Progress, StepResult, train, train_from
 from merl.training.meters import Averages, Clock, EpisodeWatch
 from merl.training.outcome import Outcome
 from merl.training.saving import Saver
-from merl.training.setup import Setup
+from merl.training.setup import Setup, load_initial_weights
 from merl.training.updating import make_update
 
 _TRAINING = Lock()

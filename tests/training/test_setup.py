@@ -12,7 +12,7 @@ import torch
 import merl
 from merl.cli import main
 from merl.core import MerlError
-from merl.training.initial import load_initial_weights
+from merl.training.setup import load_initial_weights
 
 TINY = ["train", "reach_duplo", "--preset", "smoke", "--steps", "260", "--eval.every", "0"]
 TINY += ["--threads", "1", "--agent.precision", "fp32"]

@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from merl.core.statistics import bootstrap_interval, wilson_interval
-from small_tasks import SPLIT, optimum, returns_of
 from merl.report.curves import Curve, curve_of, read_metrics
 from merl.report.drawing import (
     INK,
@@ -28,6 +27,7 @@ from merl.report.drawing import (
 )
 from merl.report.figures import learning_curves
 from merl.report.references import references
+from small_tasks import SPLIT, optimum, returns_of
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA, IMAGES = ROOT / "results", ROOT / "docs/images"

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from merl.core.statistics import bootstrap_interval
-from small_tasks import CASES, WHOLE, Case, learn, optimum, returns_of
 from merl.report.curves import read_metrics
+from small_tasks import CASES, WHOLE, Case, learn, optimum, returns_of
 
 EVALUATIONS = 10  # per run; the last one is at its end
 OUTPUT = Path(__file__).resolve().parent.parent / "results/small_tasks.csv"

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from merl.core.statistics import bootstrap_interval
+from merl.report.curves import read_metrics
 from small_tasks import (
     CASES,
     PENDULUM,
@@ -21,7 +22,6 @@ from small_tasks import (
     optimum,
     returns_of,
 )
-from merl.report.curves import read_metrics
 
 STEPS = {(case.task, case.agent): case.steps for case in CASES}
 

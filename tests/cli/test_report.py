@@ -39,9 +39,7 @@ def test_watch_follows_runs_that_are_training(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "merl.cli", "report", str(folder), "--out", str(out)]
     command += ["--watch", "1", "--baseline", "slow"]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     assert "has no evaluation yet" in process.stdout.readline()
     write_run(folder / "reach_duplo-merl-s1", [9], [0], seed=1)

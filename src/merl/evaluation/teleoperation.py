@@ -189,9 +189,7 @@ def record_by_hand(
             return action_for(window.read())
 
         limits = Limits(late=10**9)
-        driven = drive(
-            act, env, observation, rate, limits, window.ended, record=recording.add
-        )
+        driven = drive(act, env, observation, rate, limits, window.ended, record=recording.add)
         if window.discards or not len(recording):
             continue
         episode = recording.finish(terminated=driven.end == "terminated")

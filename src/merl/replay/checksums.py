@@ -9,7 +9,7 @@ the ring has overwritten a part of it.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypedDict
 
@@ -138,16 +138,26 @@ class Checksums:
         for index, (first, last) in enumerate(ranges(covered["oldest"], covered["newest"])):
             if first <= after:
                 continue
-            differ = lambda name: self._add(name, first, last, 0) != sums[name][index]  # noqa: B023, E731
             others = self._data.arrays.keys() - {*spans, *spans.values()}
-            found = {name for name in others if differ(name)}
+            found = self._differing(others, sums, index, first, last)
             # Right frames have right spans: where they lie changes when the replay grows.
             for name, span in spans.items():
                 if not self._data.spans_fit(name, span, first, last):
                     found.add(span)
-                elif differ(name):
-                    found.add(span if differ(span) else name)
+                elif self._differing([name], sums, index, first, last):
+                    found |= self._differing([span], sums, index, first, last) or {name}
             yield from ((name, first, last) for name in sorted(found))
+
+    def _differing(
+        self,
+        names: Iterable[str],
+        sums: Mapping[str, list[int]],
+        index: int,
+        first: int,
+        last: int,
+    ) -> set[str]:
+        """Return the fields whose checksum of a block is not the known one."""
+        return {name for name in names if self._add(name, first, last, 0) != sums[name][index]}
 
     def _add(self, name: str, first: int, last: int, sum_: int) -> int:
         """Return the checksum of a field that ends with timestep `first` - 1, up to `last`."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from merl.acting.environments import Step
 from merl.core import MerlError, Observation
 from merl.demos.demonstrations import store
-from merl.demos.episode import Episode, EpisodeRecording
+from merl.demos.episode import EpisodeRecording
 from merl.demos.recorder import Recorder
 from merl.replay import ReplayBuffer
 

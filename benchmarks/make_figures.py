@@ -84,7 +84,7 @@ def laptop() -> None:
     lines = {row.name: row.returns.mean for row in references("reach_duplo")}
     lines.pop("no motion")
     learning_curves(
-        {"MERL, preset laptop": sorted((DATA / "speedrun").glob("laptop-10-s?.csv"))},
+        {"MERL, preset laptop": sorted((DATA / "speedrun").glob("laptop-avx2-10-s?.csv"))},
         IMAGES / "laptop.png",
         x="minutes",
         references=lines,

@@ -94,16 +94,6 @@ def test_a_failed_video_does_not_end_the_evaluation(
         evaluate(zero_action, DotEnv(), 3, video=tmp_path / "film.mp4")
 
 
-def test_a_reset_that_fails_leaves_no_part_of_a_video(tmp_path: Path) -> None:
-    class Broken(DotEnv):
-        def reset(self, **options: Any) -> Any:
-            raise MerlError("the arm is off")
-
-    with pytest.raises(MerlError, match="the arm is off"):
-        evaluate(zero_action, Broken(), 1, video=tmp_path / "film.mp4")
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("fps", "rate"),
     [

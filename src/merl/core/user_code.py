@@ -124,11 +124,15 @@ def in_one_line(error: BaseException) -> str:
     except Exception:  # the exception's own __str__ may fail
         text = ""
     kind = type(error).__name__
-    described = f"{kind}: {text}" if text else kind
+    return (f"{kind}: {text}" if text else kind) + place(error)
+
+
+def place(error: BaseException) -> str:
+    """Return the last line in the user's files that led to an exception: " (FILE, line N)"."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if _is_users(frame.filename):
-            return f"{described} ({Path(frame.filename).name}, line {frame.lineno})"
-    return described
+            return f" ({Path(frame.filename).name}, line {frame.lineno})"
+    return ""
 
 
 def _is_users(filename: str) -> bool:

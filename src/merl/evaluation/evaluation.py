@@ -155,10 +155,10 @@ def _run_episode(
     """Run one episode; return it, a digest of its start, and whether it ended by itself."""
     episode, over = Episode(), False
     seed = EVALUATION_SEED + index
+    seed_global_generators(seed)
+    observation, _ = env.reset(seed=seed)
+    start = _digest(observation)
     try:
-        seed_global_generators(seed)
-        observation, _ = env.reset(seed=seed)
-        start = _digest(observation)
         while not over and episode.length < max_steps:
             observation, reward, terminated, truncated, info = env.step(act(observation))
             check_finite(observation, float(reward), episode.length + 1, "of an evaluation")

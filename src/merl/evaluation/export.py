@@ -27,7 +27,7 @@ from merl.acting.run_env import recipe
 from merl.agents.ddpg import DDPG
 from merl.core import MerlError, check_choice
 from merl.core.files import cause, remove
-from merl.core.user_code import in_one_line
+from merl.core.user_code import place
 from merl.evaluation.exported import FORMER, NEXT, Form, Run, Values, card_of, load_exported
 from merl.evaluation.policy import Policy
 from merl.evaluation.to_numpy import numpy_program
@@ -170,8 +170,10 @@ def _translating(form: Form) -> Iterator[None]:
     except (MerlError, OSError):
         raise
     except Exception as error:  # a user's encoder may do what no exporter can translate
+        source = error.__cause__ or error  # torch.onnx adds a page of advice
+        first = (str(source).strip().splitlines() or [type(source).__name__])[0]
         raise MerlError(
-            f"the policy cannot be written as {form}: {in_one_line(error)}: its encoders must "
+            f"the policy cannot be written as {form}: {first}{place(source)}: its encoders must "
             "consist of operations that torch.export knows, without branches on values"
         ) from error
 

@@ -127,7 +127,6 @@ class ReplacesHandlers(DotEnv):
 
     def render(self) -> Any:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        return super().render()
 
     def close(self) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)

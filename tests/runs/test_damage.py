@@ -119,7 +119,7 @@ def test_a_flipped_bit_is_named_or_changes_nothing(
                 assert weights(copy) == right, (name, kind)
             else:
                 assert (code, kind, one_line(err)) == (2, "damaged", True), (name, err)
-    assert min(found.values()) > 5, found
+    assert min(found.values()) > 2, found
 
 
 @pytest.mark.parametrize(

@@ -57,8 +57,8 @@ def make_user_env(
         MerlError: there is no such environment, or agents cannot learn in it.
     """
     env = _make(task, render_mode, make)
-    # One that does not render is kept: making it again would move a robot again.
-    if env.render_mode is not None and not _renders(env):
+    # One without a render mode is kept: making it again would move a robot again.
+    if render_mode is not None and env.render_mode is not None and not _renders(env):
         close_env(env)
         env = _make(task, None, make)
     if env.has_wrapper_attr("own_bounds"):

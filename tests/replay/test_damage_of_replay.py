@@ -135,6 +135,20 @@ def test_a_replay_that_grew_is_not_damaged(tmp_path: Path, compress: bool) -> No
     assert find_damage(tmp_path, replay.spec, saved(replay)) == []
 
 
+def test_an_episode_in_progress_that_is_left_out_does_not_go_on(tmp_path: Path) -> None:
+    """Its next step would begin with a damaged observation."""
+    replay = make(tmp_path, compress=False)
+    play(replay, 0, 40)
+    state, slots = saved(replay), replay.slots
+    assert state["open"]
+    at = 39 * replay.arrays["reward"][0].nbytes
+    del replay
+    flip(tmp_path / str(slots) / "reward.bin", at)
+    replay = make(tmp_path, compress=False)
+    replay.load_state_dict(state, skip_damaged=True)
+    assert not replay.state_dict()["open"]
+
+
 def test_spans_that_do_not_fit_their_file_are_damage(tmp_path: Path) -> None:
     replay = make(tmp_path)
     play(replay, 0, 40)
